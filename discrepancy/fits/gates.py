@@ -19,6 +19,8 @@ from .problem import Problem
 
 ABSOLUTE_FIT_LEVEL = 1e-3
 """Level of the test of absolute fit: the probability that a true hypothesis fails it."""
+GAIN = "gain_error"
+"""Name of the parameter of an effect that is the relative error of a sensor or a load cell."""
 LEAST_SHAPE_GAIN = 2.0
 """Gain of log evidence by a free shape above which a verdict names the family of the effect, and
 not the effect [nat]."""
@@ -132,7 +134,9 @@ def prior_tests(problem: Problem, fit: CandidateFit) -> list[NamedTest]:
     law can fit them with extreme parameters, which make it another law: a joint that slips at zero
     force is a soft joint. These are χ² tests, and conservative, since estimates scatter less than
     the prior. A calibrated parameter at the end of its range fails in any case. Magnitudes, free
-    shapes and parameters with a uniform prior are not tested, as they may have any value.
+    shapes and parameters with a uniform prior are not tested, as they may have any value. The
+    magnitude of a gain is tested: a sensor that reads twice as much is more often at a place where
+    the structure differs.
     """
     # scaled unknowns are standard normal under their prior: their sum of squares is χ²
     layout = problem.shared
@@ -159,9 +163,12 @@ def prior_tests(problem: Problem, fit: CandidateFit) -> list[NamedTest]:
         for parameter, scaled_value in zip(term.effect.parameters, values.tolist(), strict=False):
             # the ends of a uniform prior are as probable as its middle
             is_uniform = parameter.prior.shape == "uniform"
-            if parameter.magnitude or is_uniform:
+            is_gain = parameter.name == GAIN
+            if is_uniform or (parameter.magnitude and not is_gain):
                 continue
             name = f"{parameter.name} of {term.effect.identifier} outside its prior"
+            if is_gain:
+                name += f" ({100.0 * parameter.prior.value(scaled_value):+.3g} %)"
             tests.append(NamedTest(name, float(chi2.sf(scaled_value**2, 1))))
     return tests
 

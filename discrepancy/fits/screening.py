@@ -27,7 +27,7 @@ from discrepancy.catalogue.entry import EffectParameter, ShapeParameter
 from discrepancy.errors import DiscrepancyError
 from discrepancy.search_settings import SEARCH
 
-from .candidate import Candidate, EffectTerm
+from .candidate import Candidate, EffectTerm, Point
 from .fitting import CandidateFit
 from .normal_equations import check_finite, cholesky_factor, normal_equations
 from .problem import Problem
@@ -117,6 +117,7 @@ class Screen:
         eliminated_effects = Candidate() if effect_precision is None else fit.candidate
         equations = normal_equations(problem, fit, eliminated_effects, precision, effect_precision)
         self._trials = equations.trials
+        self._eliminated_count = eliminated_effects.parameter_count
         self._nuisance_count = len(equations.gradient)
         factor = cholesky_factor(equations.matrix)
         # U^-T with H = U^T U: then (J c)^T H^-1 (J d) is the inner product of U^-T J c and U^-T J d
@@ -151,6 +152,45 @@ class Screen:
         effect = np.concatenate((self.fit.point.effect, effect_values))
         vector, overlap, squared_size = self._project_change(candidate, effect, term.effect.acts_on)
         return ScreenedChange(term, effect_values, vector, overlap, max(squared_size, 0.0))
+
+    def refit_with_effect(self, term: EffectTerm, effect_values: FloatArray) -> tuple[float, Point]:
+        """Refit what is eliminated, to first order, if one more effect acts.
+
+        Parameters
+        ----------
+        term : EffectTerm
+            The effect at its place, added to those of the fit.
+        effect_values : (E,) array
+            The scaled parameters of the effect.
+
+        Returns
+        -------
+        objective : float
+            The negative log posterior [nat], up to the same constant as that of a fit.
+        point : Point
+            The refitted unknowns.
+        """
+        problem, point = self.problem, self.fit.point
+        change = self.change_by_effect(term, effect_values).vector
+        # H x = g - J d, with the projections U^-T J d at the end of the vector
+        projections = change[len(change) - self._nuisance_count :]
+        step = self._inverse_factor.T @ (self._gradient - projections)
+        shared = point.shared + step[: len(point.shared)]
+        own_effect = point.effect.copy()
+        own_effect[: self._eliminated_count] += step[len(shared) :][: self._eliminated_count]
+        effect = np.concatenate((own_effect, effect_values))
+        local, residuals = [], []
+        squares = float(problem.shared.precision @ shared**2 + effect @ effect)
+        first_reading = 0
+        for rows, indices in self._trials:
+            local.append(rows.local_values + step[indices[: len(rows.local_values)]])
+            squares += float(rows.local_precision @ local[-1] ** 2)
+            trial_change = change[first_reading : first_reading + rows.residual.size]
+            first_reading += rows.residual.size
+            residual = rows.residual - trial_change - step[indices] @ rows.jacobian
+            residuals.append(residual.reshape(-1, len(rows.precision_root)) / rows.precision_root)
+        misfit = problem.misfit(problem.squares_by_channel(residuals))
+        return misfit + 0.5 * squares, Point(shared, tuple(local), effect)
 
     def misfit_rise(self, effect: FloatArray) -> float:
         """Return the rise of the misfit at other parameters (E,) of the fit's own effects [nat]."""

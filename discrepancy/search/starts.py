@@ -17,7 +17,7 @@ from discrepancy.campaign.records import FloatArray
 from discrepancy.catalogue.entry import Effect, Setting
 from discrepancy.errors import DiscrepancyError
 from discrepancy.fits.candidate import Candidate, EffectTerm, Point
-from discrepancy.fits.fitting import CandidateFit, objective
+from discrepancy.fits.fitting import CandidateFit, fit, objective, try_fit
 from discrepancy.fits.problem import Problem
 from discrepancy.fits.screening import Screen, ScreenedChange
 from discrepancy.search_settings import SEARCH
@@ -73,7 +73,7 @@ def changes_structure(effect: Effect, setting: Setting) -> bool:
     return not all(isinstance(primitive, (*SENSORS, *READ_PLACES)) for primitive in patch)
 
 
-def _moves_frequencies(effect: Effect, setting: Setting) -> bool:
+def moves_frequencies(effect: Effect, setting: Setting) -> bool:
     """Return whether an effect changes mass or linear stiffness, so that phases drift."""
     places = effect.places(setting)
     if not places:
@@ -123,7 +123,7 @@ def best_changes_by_effect(screen: Screen, effect: Effect) -> list[ScreenedChang
     setting = screen.problem.setting
     places = free_places(effect, screen.fit.candidate, setting)
     has_few_places = len(places) <= SEARCH.few_places
-    moves_frequencies = _moves_frequencies(effect, setting)
+    shifts_phases = moves_frequencies(effect, setting)
     varied_parameter_count = sum(
         not parameter.magnitude and parameter.levels != 1 for parameter in effect.parameters
     )
@@ -141,7 +141,7 @@ def best_changes_by_effect(screen: Screen, effect: Effect) -> list[ScreenedChang
                 effect, setting
             )
             # a large change that is not linear in its magnitude is tried at a small one too
-            if is_nonlinear and (has_few_places or moves_frequencies):
+            if is_nonlinear and (has_few_places or shifts_phases):
                 with suppress(DiscrepancyError):
                     small_change, _ = screen.shrink_change(change)
                     tried_changes.append(small_change)
@@ -264,12 +264,13 @@ def grid_starts(problem: Problem, base: CandidateFit, effect: Effect) -> list[Fi
     which is linear, is not reliable.
 
     If the effect changes mass or stiffness at one of many places, the grid covers only the best few
-    places (see `_best_places`), and the best point of each of them is returned.
+    places (see `_best_places`), and the best point of each of them is returned. Where errors of a
+    mesh are fitted, this is the point that a fit to the first periods gives.
 
     Parameters
     ----------
     base : CandidateFit
-        The fit that the effect is added to.
+        The fit that the effect is added to, with the derivatives at its point.
     effect : Effect
         The effect; all its places are tried where the base does not have it.
     """
@@ -279,12 +280,15 @@ def grid_starts(problem: Problem, base: CandidateFit, effect: Effect) -> list[Fi
     level_count = level_counts[min(varied_count, len(level_counts) - 1)]
     # medians of intervals of equal prior probability
     levels = ndtri((np.arange(level_count) + 0.5) / max(level_count, 1))
-    is_chosen_by_place = len(places) > SEARCH.few_places and _moves_frequencies(
+    is_chosen_by_place = len(places) > SEARCH.few_places and moves_frequencies(
         effect, problem.setting
     )
     if is_chosen_by_place:
-        places = _best_places(problem, base, effect, places, levels)
-    points = _grid_points(problem, base, effect, places, levels)
+        best_places = _best_places(problem, base, effect, places, levels)
+        if problem.model.nuisance_parameters:
+            return [point.start for point in best_places]
+        places = tuple(point.place for point in best_places)
+    points = _grid_points(problem, base, _refitting_screen(problem, base), effect, places, levels)
     if is_chosen_by_place:
         best_of_places = {point.place: point for point in reversed(points)}
         points = sorted(best_of_places.values(), key=lambda point: point.objective)
@@ -298,28 +302,54 @@ def _best_places(
     effect: Effect,
     places: Sequence[str],
     levels: FloatArray,
-) -> tuple[str, ...]:
-    """Return the places at which an effect lowers the objective most in the first periods.
+) -> list["_GridPoint"]:
+    """Return the best points at the places where an effect explains the first periods best.
 
     Each place is searched on its own, since the magnitude that gives the measured first frequency
     differs between places. Every `SEARCH.coarse_level_step`-th of the levels (L,) is tried first,
     then the levels next to the best of them. Objectives are compared to two digits; places that are
-    then equal stay in their given order, in which named sets of nodes come first.
+    then equal stay in their given order, in which named sets of nodes come first. Where errors of a
+    mesh are fitted, the points are fitted to the first periods: in the whole record, phases drift
+    too far for a fit to begin at a grid.
     """
     early_problem = _problem_of_first_periods(problem)
+    early_base = base
+    if problem.model.nuisance_parameters:
+        early_base = fit(early_problem, base.candidate, base.point, iterations=0)
+    screen = _refitting_screen(early_problem, early_base)
+
+    def points_at(place: str, place_levels: FloatArray) -> list[_GridPoint]:
+        """Return the points of a grid at one place, the best first."""
+        return _grid_points(early_problem, early_base, screen, effect, [place], place_levels)
+
     half_step = SEARCH.coarse_level_step // 2
     coarse_numbers = np.arange(half_step, len(levels), SEARCH.coarse_level_step)
-    best_of_place = {}
+    best_of_places = []
     for place in places:
-        coarse = _grid_points(early_problem, base, effect, [place], levels[coarse_numbers])
+        coarse = points_at(place, levels[coarse_numbers])
         if not coarse:
             continue
         number = int(np.argmin(np.abs(levels - coarse[0].start.point.effect[len(base.effect)])))
         nearby = levels[max(number - half_step, 0) : number + half_step + 1]
-        fine = _grid_points(early_problem, base, effect, [place], nearby)
-        best_of_place[place] = min(point.objective for point in (*coarse, *fine))
-    ranked = sorted(best_of_place, key=lambda place: float(f"{best_of_place[place]:.1e}"))
-    return tuple(ranked[: SEARCH.places_far_from_data])
+        fine = points_at(place, nearby)
+        best_of_places.append(min((*coarse, *fine), key=lambda point: point.objective))
+    best_of_places.sort(key=lambda point: float(f"{point.objective:.1e}"))
+    best_of_places = best_of_places[: SEARCH.places_far_from_data]
+    if not problem.model.nuisance_parameters:
+        return best_of_places
+    points = []
+    for best in best_of_places:
+        early_fit = try_fit(
+            early_problem,
+            best.start.candidate,
+            best.start.point,
+            nearby_derivatives=early_base.trial_derivatives,
+            iterations=SEARCH.rough_fit_iterations,
+        )
+        if early_fit is not None:
+            start = best.start._replace(point=early_fit.point)
+            points.append(_GridPoint(early_fit.objective, best.place, start))
+    return points
 
 
 def _problem_of_first_periods(problem: Problem) -> Problem:
@@ -335,6 +365,13 @@ def _problem_of_first_periods(problem: Problem) -> Problem:
     return problem.with_first_samples(int(SEARCH.first_periods * period / min(intervals)))
 
 
+def _refitting_screen(problem: Problem, base: CandidateFit) -> Screen | None:
+    """Return the screen of a base where errors of the mesh are fitted, which hide a change."""
+    if not problem.model.nuisance_parameters:
+        return None
+    return Screen(problem, base, effect_precision=np.ones(base.candidate.parameter_count))
+
+
 class _GridPoint(NamedTuple):
     """The start of a fit at a point of a grid, the place of its effect and its objective [nat]."""
 
@@ -346,6 +383,7 @@ class _GridPoint(NamedTuple):
 def _grid_points(
     problem: Problem,
     base: CandidateFit,
+    screen: Screen | None,
     effect: Effect,
     places: Sequence[str],
     levels: FloatArray,
@@ -353,7 +391,8 @@ def _grid_points(
     """Return the points of a parameter grid of an effect at some places, the best first.
 
     Each parameter is tried at all scaled values in `levels` (L,), or only at its median if the
-    catalogue gives it one level. Points at which the model cannot be evaluated are left out.
+    catalogue gives it one level. With a screen of the base, all other unknowns are refitted at each
+    point, to first order. Points at which the model cannot be evaluated are left out.
     """
     points = []
     for place in places:
@@ -362,6 +401,10 @@ def _grid_points(
         for values in product(*axes):
             start = start_with_added_effect(base, term, np.array(values))
             with suppress(DiscrepancyError):  # the effect is larger than the model allows
-                value = objective(problem, start.candidate, start.point)
+                if screen is None:
+                    value = objective(problem, start.candidate, start.point)
+                else:
+                    value, refitted_point = screen.refit_with_effect(term, np.array(values))
+                    start = start._replace(point=refitted_point)
                 points.append(_GridPoint(value, place, start))
     return sorted(points, key=lambda point: point.objective)

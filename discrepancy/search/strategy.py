@@ -38,6 +38,7 @@ from .starts import (
     changes_structure,
     grid_starts,
     ignore_progress,
+    moves_frequencies,
     report_each,
     start_with_added_effect,
 )
@@ -119,11 +120,21 @@ class Search(FittedCandidates):
             check_absolute_fit(self.problem, fit).passed and not self._is_far_from_truth(fit)
             for fit in fits
         )
-        needs_grid = has_large_residuals or (self._is_far_from_truth(base) and not some_fit_passes)
-        if needs_grid:
+        is_far = self._is_far_from_truth(base)
+        effects_on_grid: list[Effect] = []
+        if has_large_residuals or (is_far and not some_fit_passes):
+            effects_on_grid = structural_effects
+        elif is_far and self.problem.model.nuisance_parameters:
+            # an error of a sensor that passes by moving gains, too, is no reason to leave them out
+            effects_on_grid = [
+                effect
+                for effect in structural_effects
+                if moves_frequencies(effect, self.problem.setting)
+            ]
+        if effects_on_grid:
             unbiased_base = self._with_unbiased_nuisances(base)
             starts_by_effect = []
-            for effect in structural_effects:
+            for effect in effects_on_grid:
                 starts = grid_starts(self.problem, unbiased_base, effect)
                 if starts:
                     starts_by_effect.append(starts)
@@ -159,7 +170,9 @@ class Search(FittedCandidates):
         fitted. The effect of the largest gain is fitted first.
         """
         has_effects = bool(base.candidate.terms)
-        least_gain = SEARCH.least_gain_to_add if has_effects else SEARCH.least_gain_to_fit
+        least_gain = SEARCH.least_gain_to_fit
+        if has_effects:  # what the score asks of a further effect
+            least_gain = SEARCH.least_gain_to_add + self._mesh_error_misfit
         starts_by_effect = []
         for changes in self._promising_changes(base, effects, least_gain):
             starts = [
@@ -197,10 +210,15 @@ class Search(FittedCandidates):
         """Return the base with all nuisances at their prior means.
 
         The fitted nuisances of a wrong model compensate a part of its error, so fits should not
-        begin with them.
+        begin with them. The objective stays that of the base. Where errors of a mesh are fitted,
+        the returned base has the derivatives at the prior means.
         """
-        point = self.problem.prior_mean_point(base.candidate)
-        return replace(base, point=replace(point, effect=base.effect), trial_derivatives=())
+        point = replace(self.problem.prior_mean_point(base.candidate), effect=base.effect)
+        if self.problem.model.nuisance_parameters:
+            at_means = try_fit(self.problem, base.candidate, point, iterations=0)
+            if at_means is not None:
+                return replace(at_means, objective=base.objective)
+        return replace(base, point=point, trial_derivatives=())
 
     def _fit_from_starts(
         self, starts_by_effect: Sequence[Sequence[FitStart]], base: CandidateFit, least_gain: float
@@ -491,7 +509,10 @@ class Search(FittedCandidates):
             values = np.concatenate((pair.first.best_values, pair.second.best_values))
             start = FitStart(candidate, replace(self.no_effect.point, effect=values))
             starts_by_pair.append([start])
-        rough_fits = self._fit_from_starts(starts_by_pair, self.no_effect, 0.0)
+        # a pair that stays far above the best fit cannot become the best
+        best_gain = self.no_effect.objective - self.best().objective
+        least_gain = max(best_gain - SEARCH.largest_rough_deficit, 0.0)
+        rough_fits = self._fit_from_starts(starts_by_pair, self.no_effect, least_gain)
         for fit in rough_fits:
             self.record_fit(fit, exact=False)
         rough_fits.sort(key=lambda fit: -self.score(fit))

@@ -301,8 +301,7 @@ class ChangeableModel(ReducedModel):
     def strain_factor(self, gauge: str, patch: Iterable[Primitive]) -> float:
         """Return the strain under a gauge over that of its patch, which lost stiffness on average.
 
-        A loss d adds the compliance u = d / (1 - d) to a patch of unit length. Over the length f it
-        adds u / f per length, and a gauge on it reads (1 + u / f) / (1 + u) times the mean strain.
+        See `fe.runtime.patch.RegionStiffnessLoss.strain_over_mean`.
         """
         factor = 1.0
         number = int(self.patch_of_gauge[self.gauges.index(gauge)])
@@ -310,8 +309,7 @@ class ChangeableModel(ReducedModel):
             if isinstance(primitive, RegionStiffnessLoss) and (
                 number >= 0 and primitive.region == self.loss_places[number]
             ):
-                added = primitive.loss / (1.0 - primitive.loss)
-                factor *= (1.0 + added / primitive.extent) / (1.0 + added)
+                factor *= primitive.strain_over_mean
         return factor
 
     def changed_load(
@@ -365,21 +363,19 @@ class ChangeableModel(ReducedModel):
             )
         return places.index(place)
 
-    @cached_property
-    def _triangle(self) -> tuple[IntArray, IntArray]:
-        """Row and column indices of the lower triangle of a matrix (n, n)."""
-        rows, columns = np.tril_indices(len(self.column_owner))
-        return rows, columns
-
-    def parts_of_patch(self, change: int, basis: FloatArray) -> tuple[IntArray, FloatArray]:
+    def parts_of_patch(
+        self, change: int, columns: IntArray, basis: FloatArray
+    ) -> tuple[IntArray, FloatArray]:
         """Return the contributions of a patch to the stiffness terms, in a subspace.
 
         Parameters
         ----------
         change : int
             Number of the change, from one.
-        basis : (n, k) array
-            The coordinates of the model from those of the subspace.
+        columns : (m,) array of int
+            The coordinates of the model that the subspace uses.
+        basis : (m, k) array
+            These coordinates from those of the subspace.
 
         Returns
         -------
@@ -390,12 +386,10 @@ class ChangeableModel(ReducedModel):
         """
         patch = change - 1 - len(self.supports) - len(self.mass_places)
         numbers = np.flatnonzero(self.loss_patch == patch)
-        size = len(self.column_owner)
-        parts = []
-        for number in numbers:
-            lower = np.zeros((size, size))
-            lower[self._triangle] = self.loss_stiffness[number]
-            parts.append(basis.T @ (lower + np.tril(lower, -1).T) @ basis)
+        # entries of the lower triangle, which is stored row by row
+        rows = np.maximum.outer(columns, columns)
+        triangle = rows * (rows + 1) // 2 + np.minimum.outer(columns, columns)
+        parts = [basis.T @ self.loss_stiffness[number][triangle] @ basis for number in numbers]
         return self.loss_term[numbers], np.array(parts)
 
     def support_number(self, support: str, motion: str) -> int:
@@ -511,22 +505,28 @@ class _Subspaces:
         columns = np.flatnonzero(acts)
         # orthonormal in the energy norm at the midpoint of all ranges
         reference = np.append(model.bound_reference, 1.0)
-        energy = dense_sum(reference, model.whole_stiffness)[np.ix_(columns, columns)]
+        own_block = (slice(None), columns[:, np.newaxis], columns)
+        energy = dense_sum(reference, model.whole_stiffness[own_block])
         scale = 1.0 / np.sqrt(np.diag(energy))
         squares, directions = np.linalg.eigh(scale[:, np.newaxis] * energy * scale)
         is_used = squares > LEAST_DIRECTION * squares[-1]
         used_directions = directions[:, is_used] / np.sqrt(squares[is_used])
         count = int(is_used.sum())
+        # the terms hold hundreds of columns of other changes, which are left out of the products
+        columns = np.concatenate((columns, np.array(released, dtype=np.int64)))
+        rows_of_basis = np.zeros((len(columns), count + len(released)))
+        rows_of_basis[: len(scale), :count] = scale[:, np.newaxis] * used_directions
+        rows_of_basis[len(scale) :, count:] = np.eye(len(released))
         basis = np.zeros((len(acts), count + len(released)))
-        basis[columns, :count] = scale[:, np.newaxis] * used_directions
-        basis[released, np.arange(count, count + len(released))] = 1.0
+        basis[columns] = rows_of_basis
+        block = (slice(None), columns[:, np.newaxis], columns)
         return Subspace(
             basis=basis,
             released=len(released),
-            stiffness=basis.T @ model.whole_stiffness @ basis,
-            mass=basis.T @ model.whole_mass @ basis,
+            stiffness=rows_of_basis.T @ model.whole_stiffness[block] @ rows_of_basis,
+            mass=rows_of_basis.T @ model.whole_mass[block] @ rows_of_basis,
             lost={
-                change: model.parts_of_patch(change, basis)
+                change: model.parts_of_patch(change, columns, rows_of_basis)
                 for change in changes
                 if change > len(model.supports) + len(model.mass_places)
             },

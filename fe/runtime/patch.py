@@ -131,6 +131,16 @@ class RegionStiffnessLoss(Primitive):
     extent: Annotated[float, "1"] = 1.0
     """Length of what lost stiffness over that of the patch."""
 
+    @property
+    def strain_over_mean(self) -> float:
+        """The strain of what lost stiffness over the mean strain of the patch.
+
+        A loss d adds the compliance u = d / (1 - d) to a patch of unit length. Over the length f it
+        adds u / f per length: the strain is (1 + u / f) / (1 + u) times the mean.
+        """
+        added = self.loss / (1.0 - self.loss)
+        return (1.0 + added / self.extent) / (1.0 + added)
+
 
 class StiffnessDrift(Primitive):
     """The whole stiffness drifts within a record: K (1 + `rate` t), t since its start."""

@@ -18,7 +18,7 @@ from fe.runtime.errors import InvalidDesignError
 
 from .affine import AffineStructure
 from .design import Gauge, MeshLoad
-from .gauges import gauge_rows
+from .gauges import cells_at_gauges, gauge_rows, strain_factors
 from .matrices import MatrixStructure
 from .matrix_design import MatrixLoad, MatrixMass, NodeOutput
 from .mesh import StructureMesh
@@ -278,7 +278,7 @@ def loss_places(structure: AffineStructure) -> list[LossCandidate]:
         return []
     patches = patches_of_mesh(structure.mesh, structure.design.gauge, structure.region_of)
     pairs = [(term.parameter, term.region) for term in structure.stiffness_terms]
-    cells_at_gauges = _cells_at_gauges(structure.mesh, structure.design.gauge)
+    gauge_cells = cells_at_gauges(structure.mesh, structure.design.gauge)
     places = []
     for name, cells in patches.items():
         terms = {}
@@ -286,7 +286,7 @@ def loss_places(structure: AffineStructure) -> list[LossCandidate]:
             cells_of_part = cells[structure.body.part[cells] == part_number]
             if len(cells_of_part):
                 terms[pairs.index(pair)] = structure.body.stiffness(cells_of_part)
-        gauges = np.flatnonzero(np.isin(cells_at_gauges, cells)).tolist()
+        gauges = np.flatnonzero(np.isin(gauge_cells, cells)).tolist()
         places.append(LossCandidate(name, terms, tuple(gauges)))
     return places
 
@@ -313,27 +313,18 @@ def patches_of_mesh(
     remaining = np.flatnonzero(is_free_cell)
     if len(remaining):
         centres = mesh.centres[remaining]
-        cells_at_gauges = _cells_at_gauges(mesh, gauges)
+        gauge_cells = cells_at_gauges(mesh, gauges)
         centre_cells = _spread_points(
             centres,
             GRID_PATCHES,
             LEAST_DISTANCE * mesh.size,
-            preferred=np.searchsorted(remaining, cells_at_gauges[is_free_cell[cells_at_gauges]]),
+            preferred=np.searchsorted(remaining, gauge_cells[is_free_cell[gauge_cells]]),
         )
         _, patch_of = KDTree(centres[centre_cells]).query(centres)
         for number, centre_cell in enumerate(centre_cells):
             name = f"around {mesh.describe_point(np.round(centres[centre_cell], 4))}"
             patches[name] = remaining[patch_of == number]
     return patches
-
-
-def _cells_at_gauges(mesh: StructureMesh, gauges: Sequence[Gauge]) -> IntArray:
-    """Return the cell (G,) whose centre is nearest to each gauge."""
-    points = [mesh.unit * np.asarray(gauge.point) for gauge in gauges]
-    if not points:
-        return NO_POINTS
-    _, cells = KDTree(mesh.centres).query(points)
-    return np.asarray(cells, dtype=np.int64)
 
 
 class LoadChange(NamedTuple):
@@ -428,9 +419,10 @@ def strains_across(structure: AffineStructure) -> list[sparse.csr_array]:
         no_rows = sparse.csr_array((0, structure.unknowns))
         return [no_rows, no_rows]
     along = structure.gauge_output
+    factors = strain_factors(structure.mesh, structure.design)
     rows = []
     for turn in (0.5 * np.pi, 0.25 * np.pi):
-        turned, _ = gauge_rows(structure.mesh, structure.design.gauge, turn)
+        turned, _ = gauge_rows(structure.mesh, structure.design.gauge, turn, factors=factors)
         rows.append((turned @ structure.expansion).tocsr())
     across, halfway = rows
     return [across, (2.0 * halfway - along - across).tocsr()]
@@ -465,7 +457,8 @@ def gauge_shifts(structure: AffineStructure) -> list[GaugeShift]:
     mesh = structure.mesh
     step = GAUGE_STEP * mesh.size
     shifts = []
-    for gauge in structure.design.gauge:
+    factors = strain_factors(mesh, structure.design).tolist()
+    for gauge, factor in zip(structure.design.gauge, factors, strict=True):
         middle, _ = gauge_rows(mesh, (gauge,))
         for axis, direction in GAUGE_AXES.items():
             difference_quotients = []
@@ -478,6 +471,6 @@ def gauge_shifts(structure: AffineStructure) -> list[GaugeShift]:
                 continue
             slope = (difference_quotients[0] + difference_quotients[-1]) / 2.0
             curvature = (difference_quotients[0] - difference_quotients[-1]) / step
-            derivatives = sparse.vstack((slope, curvature)) @ structure.expansion
+            derivatives = factor * sparse.vstack((slope, curvature)) @ structure.expansion
             shifts.append(GaugeShift(gauge.name, axis, derivatives.tocsr()))
     return shifts

@@ -168,7 +168,10 @@ def _lose_stiffness(
         tables["set"] = sets
         mesh.cell_sets[set_name] = patches[primitive.region]
     losses = list(tables.get("stiffness_loss", ()))
-    losses.append({"set": set_name, "fraction": primitive.loss})
+    row = {"set": set_name, "fraction": primitive.loss}
+    if primitive.extent != 1.0:
+        row["extent"] = primitive.extent
+    losses.append(row)
     tables["stiffness_loss"] = losses
 
 

@@ -283,6 +283,9 @@ class StiffnessLoss(tables.DesignSection):
     """Set of the cells."""
     fraction: float = Field(gt=0.0, le=0.95)
     """Lost fraction of the stiffness that material and parameters give [1]."""
+    extent: float = Field(default=1.0, ge=0.05, le=20.0)
+    """Length over which the stiffness is lost over that of the set, which gauges on the set show
+    [1]."""
 
 
 class MeshMass(tables.ChosenMass):

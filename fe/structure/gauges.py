@@ -1,16 +1,19 @@
 """Strain gauges on the surface of a mesh, as rows that give strains from nodal displacements."""
 
+from collections.abc import Sequence
 from itertools import product
 from typing import NamedTuple
 
 import numpy as np
 from scipy import sparse
+from scipy.spatial import KDTree
 
 from fe.elements.elasticity import unit_vector
-from fe.runtime.arrays import FloatArray
+from fe.runtime.arrays import FloatArray, IntArray
 from fe.runtime.errors import InvalidDesignError
+from fe.runtime.patch import RegionStiffnessLoss
 
-from .design import Gauge, Rosette
+from .design import Gauge, MeshDesign, Rosette
 from .location import SurfacePoint, on_surface
 from .mesh import StructureMesh
 
@@ -45,11 +48,35 @@ class _GaugeStrain(NamedTuple):
     direction: FloatArray
 
 
+def cells_at_gauges(mesh: StructureMesh, gauges: Sequence[Gauge]) -> IntArray:
+    """Return the cell (G,) whose centre is nearest to each gauge."""
+    points = [mesh.unit * np.asarray(gauge.point) for gauge in gauges]
+    if not points:
+        return np.empty(0, dtype=np.int64)
+    _, cells = KDTree(mesh.centres).query(points)
+    return np.asarray(cells, dtype=np.int64)
+
+
+def strain_factors(mesh: StructureMesh, design: MeshDesign) -> FloatArray:
+    """Return the strain (G,) under each gauge over the mean strain of the cells about it.
+
+    They differ where these cells lost stiffness over another length than their own.
+    """
+    factors = np.ones(len(design.gauge))
+    cells = cells_at_gauges(mesh, design.gauge)
+    for label, loss in design.numbered("stiffness_loss"):
+        is_on_set = np.isin(cells, mesh.cells_of(loss.set, label))
+        change = RegionStiffnessLoss(loss.set, loss.fraction, loss.extent)
+        factors[is_on_set] *= change.strain_over_mean
+    return factors
+
+
 def gauge_rows(
     mesh: StructureMesh,
     gauges: tuple[Gauge, ...],
     turn: float = 0.0,
     offset: tuple[float, float] = (0.0, 0.0),
+    factors: FloatArray | None = None,
 ) -> tuple[sparse.csr_array, FloatArray]:
     """Return rows that give the strains of gauges from nodal displacements.
 
@@ -63,6 +90,8 @@ def gauge_rows(
         Angle from the gauge's direction to that of the strain, about the outward normal [rad].
     offset : tuple of float
         Distance by which each gauge is moved on the surface, along itself and across [m].
+    factors : (gauges,) array, optional
+        Strain that each gauge reads over that of the mesh, see `strain_factors`; one by default.
 
     Returns
     -------
@@ -82,6 +111,7 @@ def gauge_rows(
     moved = []
     for number, gauge in enumerate(gauges):
         where = f"gauge[{number + 1}] ({gauge.name})"
+        factor = 1.0 if factors is None else float(factors[number])
         point = mesh.unit * np.asarray(gauge.point)
         if any(offset):
             along, across = gauge_axes(mesh, gauge, where)
@@ -97,7 +127,7 @@ def gauge_rows(
             local_direction = np.cos(turn) * along + np.sin(turn) * across
             # the mean of the points, and of the cells that meet at each of them
             cell_count = len(surface_point.cell)
-            weight = 1.0 / (len(surface_points) * cell_count)
+            weight = factor / (len(surface_points) * cell_count)
             for cell, local_position in zip(surface_point.cell, surface_point.local, strict=True):
                 strain = _GaugeStrain(
                     gauge=number,

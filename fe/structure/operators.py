@@ -25,7 +25,7 @@ from .design import (
     load_structure,
     structure_hash,
 )
-from .gauges import gauge_rows
+from .gauges import gauge_rows, strain_factors
 from .matrices import assemble_matrices
 from .matrix_design import MatrixDesign
 from .mesh import StructureMesh
@@ -211,7 +211,7 @@ def load_and_assemble(
         supports_of_design(design, mesh, yielding=yielding),
         mass_as_stiffness=mass_as_stiffness,
     )
-    gauges, gauges_moved = gauge_rows(mesh, design.gauge)
+    gauges, gauges_moved = gauge_rows(mesh, design.gauge, factors=strain_factors(mesh, design))
     outputs = OutputRows(
         gauge=gauges,
         displacement=_point_rows(mesh, list(design.numbered("displacement"))),

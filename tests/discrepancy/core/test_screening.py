@@ -10,7 +10,7 @@ from scipy.stats import binom, chi2, kstest
 from discrepancy.campaign.noise_tests import variance_p_value
 from discrepancy.campaign.records import NoiseRecord
 from discrepancy.fits.candidate import Candidate, EffectTerm, Point, ResidualProcess
-from discrepancy.fits.fitting import fit
+from discrepancy.fits.fitting import fit, objective
 from discrepancy.fits.gates import (
     LEAST_SHAPE_GAIN,
     absolute_fit_tests,
@@ -60,6 +60,18 @@ def test_the_gain_and_start_of_a_pair_are_those_of_its_fit(screened_pair):
     start = np.concatenate((first.best_values, second.best_values))
     assert gain == pytest.approx(-misfit, rel=0.02, abs=0.05)
     np.testing.assert_allclose(start, pair.point.effect, rtol=0.03, atol=1e-3)
+
+
+def test_a_refit_with_an_effect_has_the_objective_of_its_point(screened_pair):
+    """It is lower than without the refit, and that of a fit in which the effect is known."""
+    term = screened_pair.terms[0]
+    values = np.array([0.01])
+    expected, point = screened_pair.screen.refit_with_effect(term, values)
+    problem, candidate = screened_pair.problem, Candidate((term,))
+    assert expected == pytest.approx(objective(problem, candidate, point), abs=0.01)
+    unfitted = replace(screened_pair.none.point, effect=values)
+    assert expected < objective(problem, candidate, unfitted) - 1.0
+    np.testing.assert_array_equal(point.effect, values)
 
 
 def test_one_change_alone_is_no_pair(screened_pair):
@@ -244,6 +256,22 @@ def test_unknowns_are_judged_beside_their_priors():
         "size of offset outside its prior": chi2.sf(16.0, 1),
     }
     assert told == pytest.approx(wanted)
+
+
+@pytest.mark.parametrize(("parameter_name", "is_tested"), [("gain_error", True), ("size", False)])
+def test_the_size_of_a_gain_is_tested_and_no_other(parameter_name, is_tested):
+    """A sensor that reads twice as much is no error of its gain."""
+    effect = kit.offset_effect()
+    renamed = replace(effect, parameters=(replace(effect.parameters[0], name=parameter_name),))
+    problem = kit.closed_problem(seed=1)
+    found = kit.fitted(problem, EffectTerm(effect, "y1"))
+    large = replace(
+        found,
+        candidate=Candidate((EffectTerm(renamed, "y1"),)),
+        point=replace(found.point, effect=np.array([5.0])),
+    )
+    p_values = {test.p_value for test in prior_tests(problem, large) if "of offset" in test.name}
+    assert p_values == ({float(chi2.sf(25.0, 1))} if is_tested else set())
 
 
 # ---------------------------------------------------------------- draws, and predictions of held-out trials

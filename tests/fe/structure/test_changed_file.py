@@ -102,6 +102,23 @@ def test_a_file_states_a_patch_that_lost_stiffness_and_a_mass_beside_a_point(
     assert frequencies[:2] == pytest.approx(structure.modes.frequency[:2], rel=2e-3)
 
 
+def test_a_file_states_the_length_over_which_stiffness_was_lost(
+    write_beam: WriteBeam, tmp_path: Path
+) -> None:
+    """A gauge on the cells reads more than their mean strain, by the compliance of two thirds."""
+    file = write_beam(tmp_path, cells=2)
+    readings = []
+    for extent in (1.0, 0.5):
+        patch = ModelPatch((RegionStiffnessLoss("z1", 0.4, extent),))
+        outputs, _ = full_answers(written(file, tmp_path / f"extent {extent}", patch))
+        readings.append(outputs)
+    ratios = readings[1] / readings[0]
+    added = 0.4 / 0.6
+    expected_ratio = (1.0 + added / 0.5) / (1.0 + added)
+    assert ratios[0] == pytest.approx(expected_ratio)
+    assert ratios[1:] == pytest.approx(np.ones(len(ratios) - 1))
+
+
 def test_an_fmu_of_the_written_file_carries_a_loss_and_a_mass(
     write_beam: WriteBeam, tmp_path: Path
 ) -> None:
