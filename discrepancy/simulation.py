@@ -100,7 +100,7 @@ class Simulator:
             term = EffectTerm(effect, places[int(generator.integers(len(places)))])
             normal = generator.standard_normal(len(term.parameters))
             try:
-                distance = screen.change_by_effect(term, normal).squared_size
+                distance = screen.change_by_effect(term, normal).squared_length
             except DiscrepancyError:  # the structure cannot carry an effect of this size
                 continue
             if distance >= DETECTION_DISTANCE:

@@ -139,8 +139,8 @@ class FilteredTrial:
         """The inner products (W, W) of the whitened columns, and half a log determinant [nat].
 
         The columns are the residual and its derivatives by the unknowns. The determinant is that of
-        the covariance of the readings: the product of their variances, each given those before it.
-        It is infinite if a force is so large that rounding loses the readings.
+        the covariance of the readings: the product of the variances of their innovations. It is
+        infinite if a missing force is so large that the readings are lost in rounding errors.
         """
         linear_trial = self.linear_trial
         trial = linear_trial.trial
@@ -149,7 +149,7 @@ class FilteredTrial:
             transitions, noises = self._substeps
             step_kinds = linear_trial.step_kinds
         else:
-            # without a law, a step may reach from one sample to the next
+            # without a law no substeps are needed between samples
             substeps = 1
             transitions, noises = self._free_steps(1)
             step_kinds = linear_trial.step_kinds[:: trial.substeps].copy()
@@ -173,7 +173,7 @@ class FilteredTrial:
         # the columns are minus the derivatives of the prediction: change the sign
         whitened_columns[:, 1:] *= -1.0
         half_log_determinant = 0.5 * float(np.sum(np.log(variances)[trial.used]))
-        # readings were multiplied by `white_noise_scale`, and their deviations with them
+        # the determinant is for readings over their whole noise, not over its white part
         half_log_determinant -= float(np.sum(np.log(scale) * trial.used))
         return whitened_columns.T @ whitened_columns, half_log_determinant
 

@@ -62,7 +62,7 @@ class PortedProblem:
     trial_indices : list of int
         The indices of the trials in motion in the problem.
     trial_set : TrialSet
-        The trials in motion, of which linear systems are made.
+        The trials in motion, from which linear systems are made.
     shared_priors : Priors
         The priors of the unknowns that all trials share.
     """
@@ -129,7 +129,7 @@ class PortedProblem:
         for port in ports:
             scale = scales.ports[self.ports[port]]
             rate = scale.angular_frequency or 1.0 / scales.duration
-            # 5 % of the elastic force is a small gap; the prior allows sizes far from this median
+            # 5 % of the elastic force is a small gap; the prior also allows far larger and smaller
             processes[port] = Process(0.05 * scale.stiffness * scale.displacement, 1.0 / rate)
         return processes
 

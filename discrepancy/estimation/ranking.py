@@ -172,7 +172,7 @@ class _Ranking:
         self.on_progress(f"comparing all effects{base_in_words} with the missing force")
         screened_effects = screen_effects(self.search, base, self.effects)
         if base.leaves_no_force:
-            # the screen is exact for effects that are small, as any further one is
+            # a further effect can only be small, and for small effects the screen is exact
             screened_effects = [effect for effect in screened_effects if effect.rise > 0.0]
         promising_effects = screened_effects[:rough_count]
         rough_estimates = []

@@ -31,8 +31,8 @@ def check_finite(values: FloatArray) -> FloatArray:
     """
     if not np.all(np.isfinite(values)):
         raise FitError(
-            "The model gives values or derivatives that are not finite at a point that a fit has "
-            "reached."
+            "A fit reached values of the unknowns at which the model gives values or derivatives "
+            "that are not finite; check the ranges of its parameters."
         )
     return values
 
@@ -51,7 +51,8 @@ def cholesky_factor(matrix: FloatArray) -> FloatArray:
         return np.asarray(cho_factor(check_finite(matrix), check_finite=False)[0])
     except np.linalg.LinAlgError as cause:
         raise FitError(
-            "The normal equations of a fit are singular; a parameter has no influence."
+            "The normal equations of a fit are singular: the readings do not depend on one of its "
+            "unknowns, or on several in the same way; state a prior deviation or fix one of them."
         ) from cause
 
 

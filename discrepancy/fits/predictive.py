@@ -376,17 +376,18 @@ def importance_draws(
         The draws; the same density gives the same draws.
     """
     generator = np.random.default_rng(SEED)
-    size = len(centre)
+    parameter_count = len(centre)
     mean = centre
     covariance = axes @ axes.T
-    points = np.empty((0, size))
+    points = np.empty((0, parameter_count))
     energies = np.empty(0)
     proposals = []
     for _ in range(ROUNDS):
         # draw of a Cauchy density: Student's t of one degree of freedom
-        proposal = multivariate_t(mean, covariance + 1e-12 * np.eye(size), df=1.0)
+        proposal = multivariate_t(mean, covariance + 1e-12 * np.eye(parameter_count), df=1.0)
         proposals.append(proposal)
-        new_points = proposal.rvs(POINTS_PER_ROUND, generator).reshape(POINTS_PER_ROUND, size)
+        new_points = proposal.rvs(POINTS_PER_ROUND, generator)
+        new_points = new_points.reshape(POINTS_PER_ROUND, parameter_count)
         points = np.concatenate((points, new_points))
         energies = np.append(energies, [energy(point) for point in new_points])
         # weight all points by the mixture of all proposals

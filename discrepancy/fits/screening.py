@@ -49,7 +49,7 @@ class ScreenedChange:
         `Screen.inner_product_signs`.
     overlap : float
         b(d): the overlap of the change with the residuals [nat].
-    squared_size : float
+    squared_length : float
         G(d, d): the squared distance from the model without the change, in noise variances.
     """
 
@@ -57,12 +57,12 @@ class ScreenedChange:
     effect_values: FloatArray
     vector: FloatArray
     overlap: float
-    squared_size: float
+    squared_length: float
 
     @property
     def best_scale(self) -> float:
         """The factor on the change that reduces the misfit most: b(d) / G(d, d)."""
-        return self.overlap / self.squared_size if self.squared_size > 0.0 else 0.0
+        return self.overlap / self.squared_length if self.squared_length > 0.0 else 0.0
 
     @property
     def gain(self) -> float:
@@ -150,8 +150,10 @@ class Screen:
         """
         candidate = self.fit.candidate.with_term(term)
         effect = np.concatenate((self.fit.point.effect, effect_values))
-        vector, overlap, squared_size = self._project_change(candidate, effect, term.effect.acts_on)
-        return ScreenedChange(term, effect_values, vector, overlap, max(squared_size, 0.0))
+        vector, overlap, squared_length = self._project_change(
+            candidate, effect, term.effect.acts_on
+        )
+        return ScreenedChange(term, effect_values, vector, overlap, max(squared_length, 0.0))
 
     def refit_with_effect(self, term: EffectTerm, effect_values: FloatArray) -> tuple[float, Point]:
         """Refit what is eliminated, to first order, if one more effect acts.
@@ -195,8 +197,8 @@ class Screen:
     def misfit_rise(self, effect: FloatArray) -> float:
         """Return the rise of the misfit at other parameters (E,) of the fit's own effects [nat]."""
         candidate = self.fit.candidate
-        _, overlap, squared_size = self._project_change(candidate, effect, candidate.acts_on)
-        return 0.5 * squared_size - overlap
+        _, overlap, squared_length = self._project_change(candidate, effect, candidate.acts_on)
+        return 0.5 * squared_length - overlap
 
     @np.errstate(over="ignore", invalid="ignore")
     def _project_change(
@@ -223,7 +225,7 @@ class Screen:
         return self.project(standardised_changes)
 
     def project(self, changes: Mapping[int, FloatArray]) -> tuple[FloatArray, float, float]:
-        """Return vector, overlap b and squared size G of changes of the prediction.
+        """Return vector, overlap b and squared length G of changes of the prediction.
 
         The part of the changes that refitted nuisances can compensate is projected out.
 
@@ -236,26 +238,26 @@ class Screen:
         -------
         vector : (D,) array
             The changes of all trials, then their projections on the nuisances.
-        overlap, squared_size : float
+        overlap, squared_length : float
             b(d) and G(d, d) of the module docstring.
         """
         nuisance_overlaps = np.zeros(self._nuisance_count)  # J d, with the change d of all trials
         trial_changes = []
         overlap = 0.0
-        squared_size = 0.0
+        squared_length = 0.0
         for trial_index, (trial_rows, nuisance_indices) in enumerate(self._trials):
             trial_change: FloatArray = np.zeros(trial_rows.residual.shape)
             if trial_index in changes:
                 trial_change = (changes[trial_index] * trial_rows.precision_root).ravel()
                 nuisance_overlaps[nuisance_indices] += trial_rows.jacobian @ trial_change
                 overlap += float(trial_rows.residual @ trial_change)
-                squared_size += float(trial_change @ trial_change)
+                squared_length += float(trial_change @ trial_change)
             trial_changes.append(trial_change)
         projections = self._inverse_factor @ nuisance_overlaps
         overlap -= float(self._gradient @ projections)
-        squared_size -= float(projections @ projections)
-        check_finite(np.array((overlap, squared_size)))
-        return np.concatenate((*trial_changes, projections)), overlap, squared_size
+        squared_length -= float(projections @ projections)
+        check_finite(np.array((overlap, squared_length)))
+        return np.concatenate((*trial_changes, projections)), overlap, squared_length
 
     def shrink_change(self, change: ScreenedChange) -> tuple[ScreenedChange, float]:
         """Return the change at a magnitude so small that the readings respond linearly to it.

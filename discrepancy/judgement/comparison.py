@@ -419,7 +419,7 @@ class Comparison(ABC, Generic[HypothesisT]):
             ):
                 not_refuted.append(ranked_hypothesis)
         scores = np.array([self.score(hypothesis) for hypothesis in not_refuted])
-        # the hypotheses of which one is true exactly if one of those asked about is true
+        # count each hypothesis that contains all families of one of those asked about
         families_asked_about = [family_place_pairs(hypothesis) for hypothesis in hypotheses]
         is_counted = np.zeros(len(not_refuted), dtype=bool)
         for index, hypothesis in enumerate(not_refuted):

@@ -2,8 +2,8 @@
 
 An effect that is not in the catalogue can be imitated by one of the catalogue, so closely that the
 sum of squares of many thousand samples does not show the difference. The difference then lies in
-few patterns of the readings: the response of one kind of trial has another size, slope over the
-span, or zero than the fitted effect gives it. Such a pattern is called a *direction* here. A score
+few patterns of the readings: in one kind of trial, the response has another amplitude, slope over
+the span or zero than with the fitted effect. Such a pattern is called a *direction* here. A score
 test (Rao 1948, Proc. Camb. Phil. Soc. 44, 50-57) examines whether the misfit falls along these
 directions more than by chance, while nuisances and the parameters of the effect are refitted.
 """

@@ -1,6 +1,6 @@
 """Errors of instruments that a verdict does not name.
 
-They are too small, or cannot be told from a change of the model's parameters.
+They are too small, or cannot be distinguished from a change of the model's parameters.
 """
 
 from dataclasses import replace
@@ -28,8 +28,8 @@ INSTRUMENT_PRIMITIVES = (LoadGain, *READ_PLACES, *SENSORS)
 """Primitives that describe errors of instruments."""
 
 LEAST_INSTRUMENT_ERROR = 1e-3
-"""Relative size of a gain, tare or clock error below which it is not named, as any instrument has
-errors of this size."""
+"""Relative gain, tare or clock error below which it is not named, as any instrument has errors like
+that."""
 LEAST_UNSTATED_GAIN = 1e-2
 """The same for the gain of a channel without a stated deviation, if laws alone explain as much. A
 gain is never exact, even if the campaign states no deviation."""
@@ -38,7 +38,7 @@ gain is never exact, even if the campaign states no deviation."""
 def has_one_driven_channel(problem: Problem) -> bool:
     """Return whether all trials of a campaign have a recorded drive, and there is only one channel.
 
-    An error of that channel cannot then be told from a change of the model's parameters.
+    An error of that channel cannot then be distinguished from a change of the model's parameters.
     """
     driven_kinds = (TrialKind.DRIVEN, TrialKind.FORCED)
     is_driven = all(trial.kind in driven_kinds for trial in problem.campaign.trials)
@@ -52,20 +52,19 @@ def is_negligible_instrument_error(
 
     Parameters
     ----------
-    problem : Problem
-        The campaign and model, whose scales make the sizes relative.
     least_unstated_gain : float
-        The least size of a gain of a channel without a stated deviation.
+        The relative gain error below which a gain is too small, for a channel without a stated
+        deviation.
     """
     ratios = []
     for primitive in patch:
-        size = _instrument_error(problem, primitive)
-        if size is None:
+        error = _relative_instrument_error(problem, primitive)
+        if error is None:
             return False
-        least_named_size = LEAST_INSTRUMENT_ERROR
+        least_named_error = LEAST_INSTRUMENT_ERROR
         if isinstance(primitive, SensorGain) and _has_exact_gain(problem, primitive):
-            least_named_size = least_unstated_gain
-        ratios.append(size / least_named_size)
+            least_named_error = least_unstated_gain
+        ratios.append(error / least_named_error)
     # an empty change is not an error of instruments
     return max(ratios, default=1.0) < 1.0
 
@@ -76,8 +75,8 @@ def _has_exact_gain(problem: Problem, gain: SensorGain) -> bool:
     return channel is not None and channel.gain_deviation == 0.0
 
 
-def _instrument_error(problem: Problem, primitive: Primitive) -> float | None:
-    """Return the relative size of an error of an instrument; None for other primitives."""
+def _relative_instrument_error(problem: Problem, primitive: Primitive) -> float | None:
+    """Return the relative error that a primitive gives an instrument; None for other primitives."""
     scales = problem.setting.scales
     if isinstance(primitive, LoadGain):
         tare = abs(primitive.tare) / scales.force if scales.force > 0.0 else 0.0

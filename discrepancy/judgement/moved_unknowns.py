@@ -122,7 +122,7 @@ def _name_of_zero(channel: str, trial: str) -> str:
 
 
 def _reference_sizes(problem: Problem) -> dict[str, float]:
-    """Return the size to which the move of each unknown is relative, by the name of the unknown.
+    """Return the reference value of the relative move of each unknown, by its name.
 
     It is the stated value of a parameter, one for a gain, and the largest reading for a zero.
     """

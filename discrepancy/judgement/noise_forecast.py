@@ -90,8 +90,8 @@ class NoiseForecast:
         imitation = self._imitation(overlaps, LARGEST_NOISE_REDUCTION)
         changes_of_readings = np.sqrt(np.diag(self._information)) * np.abs(imitation)
         by_name: dict[str, float] = {}
-        for name, size in zip(self._names, changes_of_readings.tolist(), strict=True):
-            by_name[name] = max(by_name.get(name, 0.0), size)
+        for name, change_of_readings in zip(self._names, changes_of_readings.tolist(), strict=True):
+            by_name[name] = max(by_name.get(name, 0.0), change_of_readings)
         largest = max(by_name.values(), default=0.0)
         ranked = sorted(by_name, key=lambda name: -by_name[name])
         named_unknowns = [

@@ -74,7 +74,10 @@ def compute_scores(residuals: ResidualSet, *, seed: int = 0) -> Scores:
         [values[is_used] for values, is_used in zip(standardised, used_by_trial, strict=True)]
     )
     if used_standardised.size == 0:
-        raise FitError("Scores need at least one used sample, but there is none.")
+        raise FitError(
+            "Scores need at least one used sample, but these trials have none; check their gaps "
+            "and the faults that were found in them."
+        )
     log_densities = [
         log_density(fitted_trial)[fitted_trial.used] for fitted_trial in residuals.trials
     ]

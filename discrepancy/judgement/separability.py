@@ -208,13 +208,14 @@ def compute_separability(
         # squared distance of the small change, scaled back to the reference, is taken if smaller.
         small_reference = _SmallChange(*screen.shrink_change(reference))
         distance = min(
-            reference.squared_size, small_reference.change.squared_size / small_reference.factor**2
+            reference.squared_length,
+            small_reference.change.squared_length / small_reference.factor**2,
         )
         row = _detectability(effect, reference, distance)
         if distance < DETECTION_DISTANCE:
             row = _with_forecast(row, reference, small_reference, forecast)
         detectability.append(row)
-        if reference.squared_size > VISIBILITY_DISTANCE:
+        if reference.squared_length > VISIBILITY_DISTANCE:
             visible_effects.append(
                 _VisibleEffect(effect.identifier, reference, [reference, *grid_changes])
             )
@@ -271,7 +272,7 @@ def _reference_change(
         return None
     largest_change = _largest_change(references)
     # the median of a place along the span may be where nothing is measured
-    if largest_change.squared_size < DETECTION_DISTANCE:
+    if largest_change.squared_length < DETECTION_DISTANCE:
         at_reference = [change for change in options if _has_reference_magnitude(change)]
         largest_change = _largest_change([largest_change, *at_reference])
     return largest_change
@@ -279,8 +280,8 @@ def _reference_change(
 
 def _largest_change(changes: Sequence[ScreenedChange]) -> ScreenedChange:
     """Return the largest change, and of those that differ by rounding errors alone the first."""
-    largest_size = max(change.squared_size for change in changes)
-    return next(change for change in changes if change.squared_size >= largest_size * (1.0 - 1e-9))
+    largest = max(change.squared_length for change in changes)
+    return next(change for change in changes if change.squared_length >= largest * (1.0 - 1e-9))
 
 
 def _changes_at_prior_median(screen: Screen, effect: Effect) -> list[ScreenedChange]:
@@ -377,7 +378,7 @@ def _distances(screen: Screen, effects: Sequence[_VisibleEffect]) -> FloatArray:
     # the first option of an effect is its reference
     small_references = [changes_of_effect[0] for changes_of_effect in small_changes]
     small_targets = [small_reference.change for small_reference in small_references]
-    # back to the size of the reference: squared distances grow with the square of it
+    # scale back to the reference: squared distances grow with the square of the magnitude
     growth = np.array([1.0 / reference.factor**2 for reference in small_references])
     distance = np.zeros((len(effects), len(effects)))
     for j, other_effect in enumerate(effects):
@@ -388,9 +389,9 @@ def _distances(screen: Screen, effects: Sequence[_VisibleEffect]) -> FloatArray:
         at_reference = reachable.squared_distances(references)
         to_first_order = small_reachable.squared_distances(small_targets) * growth
         distance[:, j] = np.minimum(at_reference, to_first_order)
-    # an effect whose reference cannot be detected is compared at the least size that can
-    squared_sizes = np.array([reference.squared_size for reference in references])
-    distance *= np.maximum(1.0, DETECTION_DISTANCE / squared_sizes)[:, None]
+    # an effect whose reference cannot be detected is compared at the least magnitude that can
+    squared_lengths = np.array([reference.squared_length for reference in references])
+    distance *= np.maximum(1.0, DETECTION_DISTANCE / squared_lengths)[:, None]
     np.fill_diagonal(distance, 0.0)
     return distance
 
@@ -458,7 +459,7 @@ class _ReachableChanges:
         signed_options *= self._screen.inner_product_signs
         target_vectors = np.array([target.vector for target in targets])
         products = np.abs(signed_options @ target_vectors.T)  # (options, targets)
-        squared_lengths = np.array([option.squared_size for option in self._options])
+        squared_lengths = np.array([option.squared_length for option in self._options])
         inverse_lengths = np.zeros(len(self._options))
         has_length = squared_lengths > 0.0
         inverse_lengths[has_length] = 1.0 / np.sqrt(squared_lengths[has_length])
@@ -468,16 +469,16 @@ class _ReachableChanges:
 
     def _squared_distance(self, target: ScreenedChange, option_number: int) -> float:
         """Return the squared distance of a change from the linear space near an option."""
-        if target.squared_size <= 0.0:
+        if target.squared_length <= 0.0:
             return 0.0
-        if self._options[option_number].squared_size <= 0.0:
-            return target.squared_size
+        if self._options[option_number].squared_length <= 0.0:
+            return target.squared_length
         if option_number not in self._spaces:
             self._spaces[option_number] = self._space_near(self._options[option_number])
         space = self._spaces[option_number]
         overlaps = space.directions @ (self._screen.inner_product_signs * target.vector)
         explained_squares = float(overlaps @ np.linalg.solve(space.gram, overlaps))
-        return max(target.squared_size - explained_squares, 0.0)
+        return max(target.squared_length - explained_squares, 0.0)
 
     def _space_near(self, option: ScreenedChange) -> _LinearSpace:
         """Return the linear space near an option.

@@ -1,1 +1,1 @@
-"""The force that a model lacks: its port, its size and share, and the events in which it acts."""
+"""The force that a model lacks: its port, how much laws explain of it, and when it acts."""

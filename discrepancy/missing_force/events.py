@@ -347,13 +347,13 @@ def _steady_force_where_needed(search: EventSearch) -> Events:
         search.process, standard_deviation=NEGLIGIBLE_DEVIATION * search.process.standard_deviation
     )
     # here the steady force is a force of events that is on in whole records
-    paths = [~off for off in search.paths_without_force]
+    paths = [~path_without_force for path_without_force in search.paths_without_force]
     (steady_force, _), score = search.fit_forces(
         (search.process, negligible_force), paths, FIRST_EVALUATIONS
     )
     forces = (steady_force, negligible_force)
-    for trial_index, off in enumerate(search.paths_without_force):
-        paths_without = [*paths[:trial_index], off, *paths[trial_index + 1 :]]
+    for trial_index, path_without_force in enumerate(search.paths_without_force):
+        paths_without = [*paths[:trial_index], path_without_force, *paths[trial_index + 1 :]]
         evidence_without = search.log_evidence(search.products(forces, paths_without))
         evidence_with = search.log_evidence(search.products(forces, paths))
         if evidence_without > evidence_with - LEAST_EVIDENCE:

@@ -1,4 +1,4 @@
-"""The missing force that a verdict reports: its port, its size, and the variables it depends on."""
+"""The missing force that a verdict reports: its port, its rms, and the variables it depends on."""
 
 from collections.abc import Mapping, Sequence
 from contextlib import suppress

@@ -402,7 +402,7 @@ class SwitchedRecord:
 
 
 def switched_step_matrices(
-    system: ForceStateSpace, event: int, lengths: FloatArray
+    system: ForceStateSpace, event_state: int, lengths: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Return transitions and noises (4 J, n, n) of steps in which the force of events is switched.
 
@@ -413,45 +413,48 @@ def switched_step_matrices(
     ----------
     system : ForceStateSpace
         The state space with the force on.
-    event : int
+    event_state : int
         The index of the force of events in the state.
     lengths : (J,) array
         The lengths of the steps [s].
     """
     on_transition, on_noise = discretise(system.generator, system.intensity, lengths)
     off_transition, off_noise = discretise(
-        zero_state(system.generator, event), zero_state(system.intensity, event), lengths
+        zero_state(system.generator, event_state),
+        zero_state(system.intensity, event_state),
+        lengths,
     )
     transitions = np.stack((off_transition, off_transition, on_transition, on_transition))
     noises = np.stack((off_noise, off_noise, on_noise, on_noise))
     # Only after the last kind of step does the force continue. After the others it is zero, or
     # begins with its stationary variance of one (second kind).
-    transitions[:3, :, event] = 0.0
-    noises[:3, :, event] = 0.0
-    noises[:3, :, :, event] = 0.0
-    noises[1, :, event, event] = 1.0
+    transitions[:3, :, event_state] = 0.0
+    noises[:3, :, event_state] = 0.0
+    noises[:3, :, :, event_state] = 0.0
+    noises[1, :, event_state, event_state] = 1.0
     shape = (-1, *system.generator.shape)
     return transitions.reshape(shape), noises.reshape(shape)
 
 
-def initial_covariances(system: ForceStateSpace, event: int) -> tuple[FloatArray, FloatArray]:
+def initial_covariances(system: ForceStateSpace, event_state: int) -> tuple[FloatArray, FloatArray]:
     """Return the covariances (n, n) of the state at the first sample with the force off, and on.
 
     Parameters
     ----------
     system : ForceStateSpace
         The state space with the force on.
-    event : int
+    event_state : int
         The index of the force of events in the state.
     """
     covariance_on = system.initial_covariance
     # A settled trial begins at rest, deflected by the force. Without the force that part of the
     # covariance is absent.
     covariance_off = covariance_on.copy()
-    covariance_off[:event, :event] -= np.outer(
-        covariance_on[:event, event], covariance_on[:event, event]
+    covariance_with_event = covariance_on[:event_state, event_state]
+    covariance_off[:event_state, :event_state] -= np.outer(
+        covariance_with_event, covariance_with_event
     )
-    return zero_state(covariance_off, event), covariance_on
+    return zero_state(covariance_off, event_state), covariance_on
 
 
 def zero_state(matrix: FloatArray, index: int) -> FloatArray:

@@ -5,7 +5,7 @@ information on the state from the readings after it (Fraser and Potter 1969, IEE
 Automatic Control 14, 387-390). Together they give the evidence of all readings.
 
 Shapes: n states, c channels, N samples, W columns that are filtered together (the residual and the
-derivatives by unknowns), S different steps, B queried samples (samples whose state is asked for).
+derivatives by unknowns), S different steps, B queried samples (for which results are returned).
 Readings are divided by the deviation of the white part of their noise.
 """
 
@@ -53,7 +53,7 @@ def filter_backward(
     output_rows, is_used, columns : (c, n), (N, c), (N, c, W) ndarray
         The readings for a unit of each state; whether each reading counts; the columns.
     query_samples : (B,) ndarray
-        The samples whose information is asked for, ascending.
+        The queried samples, ascending.
 
     Returns
     -------
@@ -228,7 +228,7 @@ class RecordFilter:
         state : FilterState
             The state of the filter before that sample.
         query_samples : (B,) array
-            The samples before which the state is asked for, ascending.
+            The queried samples, ascending.
         """
         last_query = int(query_samples[-1])
         kinds = step_of_sample[first_sample:last_query].copy()

@@ -432,7 +432,9 @@ def _windows_of_events(
     *,
     with_effect: bool,
 ) -> tuple[GapWindow, ...]:
-    """Return the windows of events, with the channels that show them and their size in these.
+    """Return the windows of events, with the channels that show them and the size of the gap.
+
+    The size is the largest rms of a channel in units of its noise.
 
     Parameters
     ----------

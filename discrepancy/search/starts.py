@@ -137,7 +137,7 @@ def best_changes_by_effect(screen: Screen, effect: Effect) -> list[ScreenedChang
             EffectTerm(effect, place), with_small_magnitude=has_few_places
         ):
             tried_changes = [change]
-            is_nonlinear = change.squared_size > SEARCH.first_order_change and changes_structure(
+            is_nonlinear = change.squared_length > SEARCH.first_order_change and changes_structure(
                 effect, setting
             )
             # a large change that is not linear in its magnitude is tried at a small one too
@@ -146,7 +146,7 @@ def best_changes_by_effect(screen: Screen, effect: Effect) -> list[ScreenedChang
                     small_change, _ = screen.shrink_change(change)
                     tried_changes.append(small_change)
             nonzero_changes = [
-                tried_change for tried_change in tried_changes if tried_change.squared_size > 0.0
+                tried_change for tried_change in tried_changes if tried_change.squared_length > 0.0
             ]
             best_of_place = sorted(
                 [*best_of_place, *nonzero_changes], key=_expected_objective_change
@@ -201,8 +201,8 @@ def best_pairs(
         inner_product = float(first_change.vector * inner_product_signs @ second_change.vector)
         gram = np.array(
             [
-                [first_change.squared_size, inner_product],
-                [inner_product, second_change.squared_size],
+                [first_change.squared_length, inner_product],
+                [inner_product, second_change.squared_length],
             ]
         )
         overlap = np.array([first_change.overlap, second_change.overlap])
@@ -235,8 +235,8 @@ def best_pairs(
 
 def _with_scale(change: ScreenedChange, scale: float) -> ScreenedChange:
     """Return a change whose best scale is the given one, so that a fit begins there."""
-    # the best scale of a change is its overlap over its squared size
-    return replace(change, overlap=scale * change.squared_size)
+    # the best scale of a change is its overlap over its squared length
+    return replace(change, overlap=scale * change.squared_length)
 
 
 def start_with_added_effect(base: CandidateFit, term: EffectTerm, values: FloatArray) -> FitStart:

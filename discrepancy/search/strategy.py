@@ -276,7 +276,7 @@ class Search(FittedCandidates):
     # ---------------------------------------------------------------- exact fits
 
     def fit_best_exactly(
-        self, rough_fits: Sequence[CandidateFit], floor_score: float
+        self, rough_fits: Sequence[CandidateFit], score_limit: float
     ) -> list[CandidateFit]:
         """Fit the best of some rough fits to convergence, and return them, the best first.
 
@@ -284,15 +284,15 @@ class Search(FittedCandidates):
         ----------
         rough_fits : sequence of CandidateFit
             The rough fits, the best first.
-        floor_score : float
+        score_limit : float
             The score below which no candidate is fitted to convergence.
         """
         if not rough_fits:
             return []
         best_score = self.score(rough_fits[0])
         # far from the truth, the scores after few steps are only roughly in order
-        margin = max(SEARCH.exact_fit_range, SEARCH.exact_fit_share * (best_score - floor_score))
-        least_score = max(best_score - margin, floor_score)
+        margin = max(SEARCH.exact_fit_range, SEARCH.exact_fit_share * (best_score - score_limit))
+        least_score = max(best_score - margin, score_limit)
         promising_fits = [
             fit for fit in rough_fits[: SEARCH.most_exact_fits] if self.score(fit) > least_score
         ]
@@ -330,8 +330,8 @@ class Search(FittedCandidates):
     def search_single_effects(self) -> None:
         """Fit all single effects, and refine the time steps for the best of them."""
         rough_fits = self.fit_one_more_effect(self.no_effect, self.effects)
-        floor_score = self.score(self.no_effect) - SEARCH.largest_single_deficit
-        self.fit_best_exactly(rough_fits, floor_score)
+        score_limit = self.score(self.no_effect) - SEARCH.largest_single_deficit
+        self.fit_best_exactly(rough_fits, score_limit)
         self.refine_time_steps()
 
     def search_sets(self) -> None:
@@ -394,8 +394,8 @@ class Search(FittedCandidates):
                 if effect.identifier not in present_identifiers or effect.at_several_places
             ]
             rough_fits = self.fit_one_more_effect(current_fit, other_effects)
-            floor_score = current_score - SEARCH.largest_longer_set_deficit
-            exact_fits = self.fit_best_exactly(rough_fits, floor_score)
+            score_limit = current_score - SEARCH.largest_longer_set_deficit
+            exact_fits = self.fit_best_exactly(rough_fits, score_limit)
             if not exact_fits or self.score(exact_fits[0]) <= current_score:
                 break
             current_fit = exact_fits[0]
@@ -431,8 +431,8 @@ class Search(FittedCandidates):
             while len(current_fit.candidate.terms) < SEARCH.largest_set:
                 current_score = self.score(current_fit)
                 rough_fits = self.fit_one_more_effect(current_fit, [effect])
-                floor_score = current_score - SEARCH.largest_longer_set_deficit
-                exact_fits = self.fit_best_exactly(rough_fits, floor_score)
+                score_limit = current_score - SEARCH.largest_longer_set_deficit
+                exact_fits = self.fit_best_exactly(rough_fits, score_limit)
                 if not exact_fits or self.score(exact_fits[0]) <= current_score:
                     break
                 current_fit = exact_fits[0]
