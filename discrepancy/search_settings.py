@@ -1,6 +1,6 @@
-"""Settings of the search for effects in one record, each number with its reason.
+"""Settings of the search for effects and of the verdict on it, each number with its reason.
 
-Gates have levels of their own (`gates`, `consistency_gate`): they judge what the search found.
+Statistical tests have levels of their own (`gates`, `consistency_gate`).
 """
 
 from dataclasses import dataclass
@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class SearchSettings:
-    """Settings of the search; gains and log evidence in nats, sizes in prior deviations."""
+    """Settings of the search; gains and log evidence in nats, scaled values in prior deviations."""
 
     # ---------------------------------------------------------------- what is probable before the
     # data
@@ -57,25 +57,26 @@ class SearchSettings:
     most_peaks: int = 3
     """Peaks of a spectrum that are tried."""
     starts_near_data: int = 2
-    """Starts of the fit of each effect, if the model is close to the data."""
+    """Points from which each effect is fitted, if the model is close to the data."""
     starts_far_from_data: int = 2
     """The same if the model is far from the data; the starts are the best points of a grid."""
     grid_levels_far_from_data: tuple[int, ...] = (1, 25, 5, 5, 3)
-    """Levels of each parameter on that grid, by the number of parameters.
+    """Levels of each parameter on that grid, by the number of parameters that are varied.
 
-    The grid is fine, because friction that ends motions has many local optima over its size, and
-    the right one is narrow."""
+    The grid is fine, because friction that ends motions has many local optima over its magnitude,
+    and the right one is narrow."""
     coarse_level_step: int = 5
-    """Every how many levels of that grid one is tried at each of many places first."""
+    """Step between the levels of that grid that are tried first at each of many places."""
     first_periods: float = 4.0
-    """Periods of the first mode that choose the places."""
+    """Number of periods of the first mode in which the best of many places are chosen."""
     places_far_from_data: int = 3
-    """Places at which all levels are then tried."""
+    """Number of these best places, at which all levels are then tried."""
     small_remainder: float = 0.05
-    """Part of the squared residuals of the model without effect below which effects that change the
-    structure are not tried at further places beside a set that has one of them."""
+    """Fraction of the squared residuals of the model without effect. If a set with an effect that
+    may act at several places leaves less, no further places are tried beside it."""
     few_places: int = 3
-    """Effects with more places than this concern single channels, and are linear in their size."""
+    """Largest number of places of an effect that is tried at a small magnitude, too. Effects with
+    more places mostly concern single channels, and are linear in their magnitude."""
     least_gain_to_fit: float = 2.0
     """Screened gain below which an effect is not fitted at all: it could not win a name."""
     least_gain_to_add: float = 4.0
@@ -87,7 +88,7 @@ class SearchSettings:
     rough_fit_iterations: int = 8
     """Iterations of a rough fit, which begins at the result of a screen."""
     largest_rough_deficit: float = 36.0
-    """A rough fit ends early if it cannot come within this log evidence of the best: three times
+    """A rough fit ends early if its objective will not come this close to the best one: three times
     `exact_fit_range`."""
 
     no_effect_iterations: int = 20
@@ -100,65 +101,70 @@ class SearchSettings:
     exact_fit_range: float = 12.0
     """Candidates this close to the best log evidence are fitted exactly; rough fits err by less."""
     exact_fit_share: float = 0.5
-    """The same as a fraction of the best gain, because rough fits of a poor model err more."""
+    """The same range as a fraction of the best gain, since rough fits of a poor model err more; the
+    larger of both ranges counts."""
     most_exact_fits: int = 4
-    """Most candidates of a scan that are fitted exactly."""
+    """Most candidates that are fitted exactly after effects were fitted roughly."""
     refit_gain: float = 5.0
-    """A candidate is fitted again if a rough fit is better than its exact fit by this."""
+    """Log evidence by which a rough fit must exceed the exact fit for a candidate to be fitted
+    again."""
     largest_single_deficit: float = 6.0
-    """Single effects this far below 'none' are not fitted exactly."""
+    """Single effects whose score is this far below 'none' are not fitted exactly."""
     largest_longer_set_deficit: float = 2.0
-    """Sets this far below the set with one effect fewer are not fitted exactly."""
+    """Sets whose score is this far below that with one effect fewer are not fitted exactly."""
 
     # ---------------------------------------------------------------- far from the truth
     far_chi_square: float = 1.5
     """Chi-squared per sample above which a model counts as far from the data."""
     far_prior_deviations: float = 4.0
-    """Prior deviations of a shared unknown above which the model counts as far, too."""
+    """Distance of a shared unknown from its prior mean, in prior deviations, above which the model
+    counts as far, too."""
 
     mesh_error: float = 0.005
-    """Relative error of a reading by the mesh of a structure, half of that of a frequency."""
+    """Relative error of a reading that the mesh of a structure causes, half of that of a
+    frequency."""
 
     # ---------------------------------------------------------------- named by the missing force
     least_low_end: float = 0.25
     """Least lower end of the fraction of the missing force that a partly named set explains."""
     contender_range: float = 12.0
-    """Sets within this log evidence are compared by the fraction of the missing force that they
-    explain."""
+    """Sets within this range of the best score are compared by the fraction of the missing force
+    that they explain."""
     least_added_share: float = 0.01
-    """Least fraction of the missing force that a further effect or a free shape must add.
+    """Least fraction of the gap that a further effect or a free shape must add.
 
-    In the trials that it was fitted to it must add three times as much, because any freedom gains
-    there."""
+    In fitted trials it must add three times as much, because any further parameter gains there."""
     nearly_complete_share: float = 0.9
-    """Least explained fraction of the missing force for laws to be named without an additional
-    error of the readings."""
+    """Fraction of the gap in held-out trials that a hypothesis surely explains, above which it may
+    leave more than noise there and still be named."""
     force_rival_range: float = 10.0
-    """Another effect within this log evidence, in a fit to the missing force, counts as equal.
-
-    That fit takes the motion as known. Trials that were not fitted may distinguish the two."""
+    """Another hypothesis within this range of the best score counts as equal, unless its share of
+    the gap is significantly smaller."""
 
     # ---------------------------------------------------------------- weighed with a remainder
     most_weighed_sets: tuple[int, ...] = (8, 4, 2)
-    """Most sets of one, two and three effects that are fitted together with a remainder."""
+    """Most sets of one, two and three effects that are considered for a fit under the noise of a
+    remainder."""
     most_weighed_fits: int = 7
     """Most of these sets that are fitted in all."""
     weighed_range: float = 60.0
-    """Sets farther below the best log evidence are not fitted: such a fit changes it by less."""
+    """Sets whose expected score is farther below the best one are not fitted: such a fit changes it
+    by less."""
     least_gap_share: float = 0.5
     """Fraction of the gap that the interval of a partly named set must reach.
 
-    If readings are compared, also the lower end of the interval must reach it.
+    If hypotheses are compared by simulations, the lower end of the interval must reach it, too.
     """
     prior_widening: float = 2.0
     """Factor by which priors of calibrated parameters and gains count as wider for a partly named
     set, because these explain part of the remainder."""
     determined_shape_deviation: float = 0.8
-    """Largest posterior deviation of a shape, in prior deviations, that a verdict reports."""
+    """Posterior deviation of a shape parameter, in prior deviations, below which a verdict reports
+    it."""
     negligible_share: float = 0.004
-    """Fraction of the gap below which a further effect must be better than a remainder."""
+    """Fraction of the gap up to which a further effect explains hardly anything."""
     least_gain_of_negligible_effect: float = 10.0
-    """Least gain of log evidence plus log prior by such an effect over the set without it.
+    """Least gain of the score by such an effect over the set without it.
 
     It is high because the effect was chosen among many."""
     reported_prior_deviations: float = 3.0
@@ -169,7 +175,7 @@ class SearchSettings:
     largest_step_error: float = 0.1
     """Largest error by the time steps, over the noise (rms over a channel of a trial)."""
     largest_step_reduction: int = 8
-    """Largest factor by which the time steps are reduced for this, from the model's own steps."""
+    """Largest factor by which the time steps are made smaller than the model's own."""
     most_refitted: int = 3
     """Number of candidates that are fitted again with smaller steps."""
 
@@ -180,4 +186,4 @@ class SearchSettings:
 
 
 SEARCH = SearchSettings()
-"""The settings that verdicts are reached with; `docs/explanation/blind_test.md` measures them."""
+"""The settings of all searches and verdicts; `docs/explanation/blind_test.md` measures them."""

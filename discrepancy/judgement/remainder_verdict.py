@@ -303,9 +303,10 @@ def unexplained_outcome(
     )
     judged_hypothesis = None
     resembles: tuple[str, ...] = ()
-    if mentioned_hypothesis is None or not _explains_mentioned_share(
-        comparison, mentioned_hypothesis
-    ):
+    explained_share = 0.0
+    if mentioned_hypothesis is not None:
+        explained_share = comparison.held_out_or_fitted_share(mentioned_hypothesis).value
+    if mentioned_hypothesis is None or explained_share < LEAST_MENTIONED_SHARE:
         sentence = f"{gap_sentences} No effect of the catalogue follows it."
     elif comparison.enlarges_error(mentioned_hypothesis):
         sentence = f"{gap_sentences} {_larger_error_sentence(comparison, mentioned_hypothesis)}"
@@ -338,11 +339,6 @@ def _gap_text(noise_verdict: Verdict) -> str:
     reasons = [gate.reason for gate in noise_verdict.gates if gate.has_failed]
     first_reason = reasons[0] if reasons else ""
     return f"There is a gap that no effect of the catalogue fits. {first_reason}".strip()
-
-
-def _explains_mentioned_share(comparison: Comparison[HypothesisT], hypothesis: HypothesisT) -> bool:
-    """Return whether a hypothesis explains enough of the gap to be mentioned in a sentence."""
-    return comparison.held_out_or_fitted_share(hypothesis).value >= LEAST_MENTIONED_SHARE
 
 
 def _hypothesis_explaining_most(comparison: Comparison[HypothesisT]) -> HypothesisT | None:

@@ -344,11 +344,12 @@ class Search(FittedCandidates):
         self.refine_time_steps()
         # a law of free shape together with a further effect could fit nearly anything
         if not self.best().candidate.has_free_shape:
-            begins_with_structure = self._is_one_change_of_structure(self.best())
-            if not begins_with_structure:
+            terms = self.best().candidate.terms
+            begins_with_several_places = len(terms) == 1 and terms[0].effect.at_several_places
+            if not begins_with_several_places:
                 self.fit_effects_at_several_places()
             self.add_effects()
-            if begins_with_structure and self._leaves_much(self.best()):
+            if begins_with_several_places and self._leaves_much(self.best()):
                 self.fit_effects_at_several_places()
         if not self.best().candidate.has_free_shape and self.is_unexplained():
             self.fit_pairs()
@@ -399,11 +400,6 @@ class Search(FittedCandidates):
             if not exact_fits or self.score(exact_fits[0]) <= current_score:
                 break
             current_fit = exact_fits[0]
-
-    def _is_one_change_of_structure(self, fit: CandidateFit) -> bool:
-        """Return whether a fit has a single effect, which may act at several places."""
-        terms = fit.candidate.terms
-        return len(terms) == 1 and terms[0].effect.at_several_places
 
     def _leaves_much(self, fit: CandidateFit) -> bool:
         """Return whether a fit leaves more than noise, and more than a small part of the gap."""
