@@ -71,7 +71,7 @@ class ScoreTest:
 
 
 def check_consistency(problem: Problem, fit: CandidateFit) -> Gate:
-    """Test whether the residuals of a fit depend on loads, runs or the channel of an effect in it.
+    """Test whether the residuals of a fit follow loads, runs or the channel of one of its effects.
 
     Parameters
     ----------

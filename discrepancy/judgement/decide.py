@@ -170,11 +170,11 @@ def _without_superfluous_effect(
 ) -> VerdictOutcome:
     """Return the verdict without those named effects that explain hardly anything.
 
-    Such an effect may only describe a small remainder, which is no noise but has no cause of its
-    own either. So if a subset explains nearly the same share of the gap, or some effects deserve no
-    name (`notable_terms`), all are compared again together with what each leaves. A subset with
-    nearly the same share then replaces the set, if it has just the effects that deserve a name, or
-    if the score of the set is not far above its own.
+    Such an effect may only describe a small remainder that is not quite noise. So if a subset
+    explains nearly the same share of the gap, or some effects deserve no name (`notable_terms`),
+    all are compared again together with what each leaves. A subset with nearly the same share then
+    replaces the set if it has just the effects that deserve a name, or if the score of the set is
+    not far above its own.
     """
     verdict, fit = outcome.verdict, outcome.fit
     may_be_named = verdict.kind in (VerdictKind.NAMED, VerdictKind.FAMILY)

@@ -28,7 +28,7 @@ from .noise_case import CheckedFit, NoiseCase
 
 
 def decide_on_noise(case: NoiseCase[HypothesisT]) -> VerdictOutcome:
-    """Return the verdict by the first rule that holds.
+    """Return the verdict by the first rule that holds, for the case that only noise may remain.
 
     The rules in words are the `[[rule]]` tables of `sentences.toml`, in the same order.
     """

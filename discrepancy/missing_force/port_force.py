@@ -234,7 +234,8 @@ def missing_force(search: ForceSearch, estimate: Estimate) -> MissingForce | Non
     """Return the missing force at one port, with the law that a hypothesis has there.
 
     The port is that of the law of the hypothesis if it has laws at one port only, otherwise the
-    port with the most evidence. The share that the law explains is not computed here.
+    port with the most evidence. If the estimate has no missing force at this port, the one that was
+    estimated at this port alone is taken. The share that the law explains is not computed here.
 
     Returns
     -------
