@@ -366,7 +366,8 @@ def _leading_estimates(
     """Return the estimates with effects in thinned records that are repeated in all samples.
 
     They are the most probable ones, within `LEADING_RANGE` of the best score. If fewer than
-    `MOST_LEADING` are, estimates with the effects of the best one at other places follow.
+    `MOST_LEADING` are, others of the families of the best one follow: the verdict compares a named
+    law with that of free exponents, and the other way round.
     """
     with_effects = [estimate for estimate in ranked_estimates if estimate.candidate.terms]
     if not with_effects:
@@ -379,9 +380,9 @@ def _leading_estimates(
         if search.score(estimate, effect_count) > least_score
     ]
     for estimate in with_effects:
-        has_same_effects = estimate.candidate.identifiers == best_estimate.candidate.identifiers
+        families = _families_at_places(estimate.candidate)
         if (
-            has_same_effects
+            families == _families_at_places(best_estimate.candidate)
             and estimate not in leading_estimates
             and len(leading_estimates) < MOST_LEADING
         ):
