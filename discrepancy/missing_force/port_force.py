@@ -210,6 +210,11 @@ class TrialForce:
     deviation: FloatArray
     law: FloatArray | None
 
+    @property
+    def left(self) -> FloatArray:
+        """The force (N,) that the law does not explain; figures draw it by its name."""
+        return self.force if self.law is None else self.force - self.law
+
 
 @dataclass(frozen=True, eq=False)
 class MissingForce:
