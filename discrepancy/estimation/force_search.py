@@ -337,13 +337,17 @@ class ForceSearch:
         return self.estimate_effects(self.estimate_without_effects, candidate, point.effect)
 
     def estimate_along_simulation(self, candidate: Candidate, point: Point) -> Estimate | None:
-        """Return the estimate of a hypothesis along its simulated motion, with small forces.
+        """Return the estimate of a hypothesis along its simulated motion.
 
-        `point` has the unknowns of a simulation that was fitted to the readings. The result is None
-        if the laws are not possible.
+        The laws are linearised along the motion that they cause without missing forces, which are
+        estimated beside them and begin small (`MotionEstimator.follow_laws`). `point` has the
+        unknowns of a simulation that was fitted to the readings. The result is None if the laws are
+        not possible.
         """
         trials = self.ported.trial_set.trials_about(point)
         estimator = self.estimator(trials)
+        # All unknowns are those of the simulation. The trajectories without effects are needed only
+        # for their first states, in which the simulated motions begin.
         start = replace(
             start_in_other_trials(self.estimate_without_effects, trials),
             effect=point.effect,

@@ -172,7 +172,8 @@ class ForceStates:
         for (port, process), index in zip(self.processes, self.force_state_indices, strict=True):
             self._fill_missing_force(state_space, port, process, index)
         self._fill_coloured_noises(state_space, first_noise_state)
-        # readings in deviations of the white part of their noise
+        # The rows so far give readings divided by the standard deviation of their whole noise. The
+        # filter's readings are divided by that of the white part of the noise alone.
         return state_space._replace(
             output_rows=state_space.output_rows * self.white_noise_scale[:, None]
         )

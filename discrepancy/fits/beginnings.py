@@ -69,10 +69,13 @@ def has_unknown_initial_state(problem: Problem) -> bool:
 
 
 def with_initial_states_of_first_readings(problem: Problem, point: Point) -> Point:
-    """Return the point with local unknowns that were fitted to the first readings of the trials.
+    """Return the point with each trial's own unknowns from a fit that began at its first readings.
 
-    They are fitted once for each trial, by the model without effect, and kept in
-    `Problem.initial_states`: the initial state of a trial is nearly the same under all hypotheses.
+    All own unknowns of a trial (`Point.local`) are replaced, the initial state among them. They are
+    fitted without effect and at the shared unknowns of the point, to the first readings and then to
+    longer and longer parts of the record. They are kept in `Problem.initial_states`, by the name of
+    the trial, since they are nearly the same under all hypotheses. If a trial of the problem has no
+    entry there, all its trials are fitted, and the entries of all are replaced.
     """
     unknowns_by_trial = problem.initial_states
     if any(data.trial.name not in unknowns_by_trial for data in problem.trials):

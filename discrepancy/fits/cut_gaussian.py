@@ -90,6 +90,8 @@ class TruncatedGaussian:
         for index, shift in enumerate(self.tilt.tolist()):
             # the range of the parameter in standard deviations about its shifted conditional mean
             factor_row = self.factor[index]
+            # `normal` is still zero for this parameter and those after it, so the product has only
+            # the parameters that are drawn already: it is the mean given these
             conditional_mean = means[..., index] + normal @ factor_row
             conditional_deviation = factor_row[index]
             low = (self.low[index] - conditional_mean) / conditional_deviation - shift

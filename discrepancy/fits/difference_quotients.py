@@ -23,7 +23,8 @@ class DifferenceQuotient(NamedTuple):
     slope : (N, C) ndarray
         The derivative on the branch on which the response is now.
     jumps : (N, C) ndarray
-        The jump of the response within one step; zero where it does not jump.
+        The response on the branch beyond a jump minus that on the present branch, both at the
+        present value; zero where the response does not jump within a step.
     """
 
     slope: FloatArray
@@ -36,12 +37,16 @@ def two_sided_quotient(
     """Return the derivative of a response with respect to an unknown, from a step to either side.
 
     It is the central quotient. A one-sided quotient has an error of half the curvature times the
-    step, which would count as information: for example on a mass, where the readings determine only
-    its ratio to the stiffness.
+    step. Such errors can make unknowns look determined that are not: if readings depend only on the
+    ratio of a stiffness to a mass, their derivatives by the logarithms of both are opposite, but
+    the one-sided quotients are not, as if the readings told the mass.
 
     Some readings jump, such as an acceleration at a reversal of dry friction. If the jump passes a
-    sample within a step, the quotient of that side is the jump over the step, which is far too
-    large. The derivative is then the quotient of the other side.
+    sample within a step, the quotient of that side is about the jump over the step, which is far
+    too large. The derivative is then the quotient of the other side. A reading counts as a jump if
+    the quotients of both sides differ by much compared with the slopes of its channel
+    (`LEAST_JUMP`), and by much more than those of its other readings (`OUTSTANDING_JUMP`): in a
+    smooth but strongly curved response they differ everywhere.
 
     Parameters
     ----------
@@ -58,7 +63,7 @@ def two_sided_quotient(
     is_large = difference > LEAST_JUMP * _rms_of_channel(smaller)
     stands_out = difference > OUTSTANDING_JUMP * _rms_of_channel(difference)
     is_jump = is_large & stands_out
-    # beyond the jump the response is that of the side with the larger quotient
+    # the branch beyond the jump, continued from its sample back to the present value of the unknown
     beyond = np.where(is_forward_smaller, below + smaller * step, above - smaller * step)
     return DifferenceQuotient(
         slope=np.where(is_jump, smaller, 0.5 * (forward + backward)),

@@ -448,25 +448,27 @@ def _with_evidence(
     """Return the fit at a state, with its Laplace evidence, covariance and degrees of freedom.
 
     The log evidence is -objective - ln(det H) / 2 with the Hessian H = U^T U, up to a constant:
-    ln(det H) / 2 is the sum of the logarithms of the diagonal of U. The log probability that all
-    stiffness losses are possible is added, so that the evidence does not count impossible ones.
+    ln(det H) / 2 is the sum of the logarithms of the diagonal of U. The log posterior probability
+    that all stiffness losses of static trials lie within their range is added, so that the evidence
+    does not count impossible losses. The degrees of freedom that the fit absorbs in a channel are
+    the sum of the leverages of its readings.
     """
     precision = problem.noise_precisions(state.squares_by_channel)
     equations = normal_equations(problem, state, candidate, precision)
     factor = cholesky_factor(equations.matrix)
     covariance = solve_factored(factor, np.eye(len(factor)))
-    # degrees of freedom: the trace of the hat matrix, channel by channel
+    # effective degrees of freedom: the trace of the hat matrix, channel by channel
     absorbed_freedom = np.zeros(len(problem.channel_names))
     for data, (trial_jacobian, unknown_indices) in zip(
         problem.trials, equations.trials, strict=True
     ):
         trial_covariance = covariance[np.ix_(unknown_indices, unknown_indices)]
+        # the diagonal (N C,) of the hat matrix J^T C J, with the derivatives J (unknowns, N C)
         leverage = ((trial_covariance @ trial_jacobian.jacobian) * trial_jacobian.jacobian).sum(
             axis=0
         )
-        np.add.at(
-            absorbed_freedom, data.channel_indices, leverage.reshape(data.weight.shape).sum(axis=0)
-        )
+        leverage_by_channel = leverage.reshape(data.weight.shape).sum(axis=0)  # over the samples
+        np.add.at(absorbed_freedom, data.channel_indices, leverage_by_channel)
     shared_count = problem.shared.unknown_count + candidate.parameter_count
     log_integral = -state.objective - float(np.log(np.diag(factor)).sum())
     return CandidateFit(

@@ -132,11 +132,17 @@ def prior_tests(problem: Problem, fit: CandidateFit) -> list[NamedTest]:
 
     A wrong model can fit the readings if calibrated parameters move far from their priors. A wrong
     law can fit them with extreme parameters, which make it another law: a joint that slips at zero
-    force is a soft joint. These are χ² tests, and conservative, since estimates scatter less than
-    the prior. A calibrated parameter at the end of its range fails in any case. Magnitudes, free
-    shapes and parameters with a uniform prior are not tested, as they may have any value. The
-    magnitude of a gain is tested: a sensor that reads twice as much is more often at a place where
-    the structure differs.
+    force is a soft joint. The tests are:
+
+    - One χ² test of all calibrated parameters together.
+    - A test that fails (p = 0) if a calibrated parameter is at the end of its range.
+    - One χ² test of all gains that have a prior, together.
+    - A χ² test of each effect parameter. Magnitudes, free shapes and parameters with a uniform
+      prior are left out, as they may have any value.
+    - A χ² test of each gain error that is an effect, although it is a magnitude: if a sensor seems
+      to read twice as much, the structure more often differs at its place.
+
+    The χ² tests are conservative, since estimates scatter less than the prior.
     """
     # scaled unknowns are standard normal under their prior: their sum of squares is χ²
     layout = problem.shared

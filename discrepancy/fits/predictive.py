@@ -36,8 +36,8 @@ def residual_set(problem: Problem, fit: CandidateFit, *, sensitivities: bool = T
     Parameters
     ----------
     sensitivities : bool
-        Whether the factor of the exact covariance of the residuals is computed (P columns for each
-        sample), or only its diagonal, the leverage.
+        Whether the factor of the exact covariance of the predictions is computed (P columns for
+        each sample), or only its diagonal, the leverage. Held-out trials have only the leverage.
 
     Notes
     -----
@@ -189,16 +189,18 @@ class _TrialPredictions:
     def fitted_trials(self, *, sensitivities: bool = False) -> list[FittedTrial]:
         """Return each trial with its prediction, residuals and their expected variance.
 
-        If `sensitivities` is true, each trial also gets `FittedTrial.sensitivity`, a factor of the
-        exact covariance of its prediction. It has a column for each unknown of the whole fit, so it
-        is computed only where a test needs it.
+        The variance follows from the posterior covariance of the prediction. That is computed as
+        two factors, by the trial's own unknowns and by the shared ones (`_CovarianceFactors`). If
+        `sensitivities` is true, each trial also gets them as one matrix, `FittedTrial.sensitivity`:
+        S with S S^T as the covariance in noise variances. It has a column for each unknown of the
+        whole fit, so it is computed only where a test needs it.
         """
         fitted_trials = []
         for trial_index, data in enumerate(self.problem.trials):
-            rows = trial_jacobian(
+            derivatives = trial_jacobian(
                 self.problem, trial_index, self.local_fit, self.local_fit.candidate, self.precision
             )
-            factors = self._covariance_factors(rows, data.unknowns.unknown_count)
+            factors = self._covariance_factors(derivatives, data.unknowns.unknown_count)
             sensitivity = self._sensitivity(trial_index, factors) if sensitivities else None
             fitted_trials.append(self._fitted_trial(trial_index, data, factors, sensitivity))
         return fitted_trials
@@ -222,20 +224,22 @@ class _TrialPredictions:
         matrix[:, begin:end] = factors.by_local.T  # by_local has a row for each unknown
         return matrix.reshape(sample_count, channel_count, -1)
 
-    def _covariance_factors(self, rows: TrialJacobian, local_count: int) -> _CovarianceFactors:
+    def _covariance_factors(
+        self, derivatives: TrialJacobian, local_count: int
+    ) -> _CovarianceFactors:
         """Return the factors of the covariance of a trial's prediction.
 
-        `rows` holds the derivatives (L + Q + E, N C) of the prediction by the unknowns: first by
-        the L = `local_count` unknowns of the trial itself, then by the shared ones.
+        The rows of `derivatives.jacobian` are those of the prediction by the L = `local_count`
+        unknowns of the trial itself, then by the shared unknowns and effects that act on it.
         """
-        local_rows, shared_rows = np.split(rows.jacobian, [local_count])
-        factor, local_per_shared = rows.eliminate_local()
+        local_rows, shared_rows = np.split(derivatives.jacobian, [local_count])
+        factor, local_per_shared = derivatives.eliminate_local()
         # A = U^T U is the precision of the local unknowns: J_l^T A^-1 J_l = (U^-T J_l)^T (U^-T J_l)
         by_local = solve_triangular(factor, local_rows, trans="T")
         # Schur complement: local unknowns follow the shared ones, J_s - J_l A^-1 B
         total_derivatives = (shared_rows - local_per_shared.T @ local_rows).T
         return _CovarianceFactors(
-            by_local, total_derivatives @ self.covariance_root[rows.shared_indices]
+            by_local, total_derivatives @ self.covariance_root[derivatives.shared_indices]
         )
 
     def _leverage_and_variance(

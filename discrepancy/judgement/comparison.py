@@ -248,7 +248,13 @@ class Comparison(ABC, Generic[HypothesisT]):
         return changes_structure(term.effect, self.problem.setting)
 
     def objection_to_naming(self, hypothesis: HypothesisT) -> str:
-        """Return the reason why a hypothesis may not be named; empty if it may be named."""
+        """Return the reason why a hypothesis may not be named; empty if it may be named.
+
+        The reason is the first of these: no effect acts on the structure; a free shape beside
+        another law; an explained share of the gap that is too low in fitted trials
+        (`_is_share_too_small`) or held-out trials (`_survives_held_out`); shared unknowns far from
+        their priors; a further test of the subclass.
+        """
         candidate = hypothesis.candidate
         if not any(self.acts_on_structure(term) for term in candidate.terms):
             return "it describes readings but no physical cause, and leaves more than noise"
@@ -296,9 +302,10 @@ class Comparison(ABC, Generic[HypothesisT]):
     def _survives_held_out(self, hypothesis: HypothesisT, least_low_end: float) -> bool:
         """Return whether held-out trials confirm a hypothesis, or at least do not contradict it.
 
-        They confirm it if the interval of its share reaches `SEARCH.least_gap_share` and does not
-        begin below `least_low_end`. Trials in which a law has hardly any force cannot test it: they
-        contradict it only if the gap is at least a tenth larger with it (`CONTRADICTING_SHARE`).
+        They confirm it if the 90 % interval of its share reaches `SEARCH.least_gap_share` and does
+        not begin below `least_low_end`. Trials in which a law has hardly any force cannot test it:
+        they contradict it only if the gap is at least a tenth larger with it
+        (`CONTRADICTING_SHARE`).
         """
         share = self.gap_share(hypothesis, held_out=True)
         if share.is_tested:
@@ -310,11 +317,12 @@ class Comparison(ABC, Generic[HypothesisT]):
         """The hypotheses that may be named, in descending order of score.
 
         Nothing speaks against naming them (`objection_to_naming`), and their scores are within
-        `SEARCH.contender_range` of the best one. A set of both laws and errors of readings is
-        fitted again without the errors of readings, as these fit whatever a law leaves. The smaller
-        set is ranked by the score of the whole set.
+        `SEARCH.contender_range` of the best one of them. A set of both laws and errors of readings
+        is replaced by its laws alone, fitted again, as errors of readings can hide what a law
+        leaves. The laws keep the score of the set that they come from; if they come from several,
+        the highest.
         """
-        contenders_with_scores: dict[CandidateKey, tuple[HypothesisT, float]] = {}
+        nameable_with_scores: dict[CandidateKey, tuple[HypothesisT, float]] = {}
         for hypothesis in self.ranked_hypotheses:
             terms = hypothesis.candidate.terms
             law_indices = [
@@ -323,19 +331,17 @@ class Comparison(ABC, Generic[HypothesisT]):
             laws_only: HypothesisT | None = hypothesis
             if 0 < len(law_indices) < len(terms):
                 laws_only = self._fit_subset(hypothesis, law_indices)
-            if not terms or laws_only is None or laws_only.candidate.key in contenders_with_scores:
+            if not terms or laws_only is None or laws_only.candidate.key in nameable_with_scores:
                 continue
             if not self.objection_to_naming(laws_only):
-                contenders_with_scores[laws_only.candidate.key] = (
+                nameable_with_scores[laws_only.candidate.key] = (
                     laws_only,
                     self.score(hypothesis),
                 )
-        best_score = max((score for _, score in contenders_with_scores.values()), default=0.0)
+        best_score = max((score for _, score in nameable_with_scores.values()), default=0.0)
         least_score = best_score - SEARCH.contender_range
         return [
-            hypothesis
-            for hypothesis, score in contenders_with_scores.values()
-            if score > least_score
+            hypothesis for hypothesis, score in nameable_with_scores.values() if score > least_score
         ]
 
     def _fit_subset(
@@ -472,7 +478,10 @@ class Comparison(ABC, Generic[HypothesisT]):
 
 
 def _is_share_too_small(share: GapShare, least_low_end: float) -> bool:
-    """Return whether the 90 % interval of a share is too low for a hypothesis to be named."""
+    """Return whether the 90 % interval of a share is too low for a hypothesis to be named.
+
+    It is too low if it ends below `SEARCH.least_gap_share`, or begins below `least_low_end`.
+    """
     low, high = share.interval
     return high < SEARCH.least_gap_share or low < least_low_end
 

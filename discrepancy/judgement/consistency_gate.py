@@ -283,7 +283,7 @@ class _DirectionGroups:
     """The directions of all tests while they are collected, by group and label."""
 
     def __init__(self) -> None:
-        self.groups: dict[str, dict[str, dict[int, FloatArray]]] = {}
+        self.by_test: dict[str, dict[str, dict[int, FloatArray]]] = {}
 
     def add_change(self, group: str, label: str, trial_index: int, change: FloatArray) -> None:
         """Add the change of the prediction of a trial to a direction.
@@ -295,25 +295,31 @@ class _DirectionGroups:
         change : (N, C) array
             The change of its prediction [unit of the channel].
         """
-        self.groups.setdefault(group, {}).setdefault(label, {})[trial_index] = change
+        self.by_test.setdefault(group, {}).setdefault(label, {})[trial_index] = change
 
 
 def directions_by_test(
     problem: Problem, fit: CandidateFit
 ) -> Mapping[str, Mapping[str, Direction]]:
-    """Return the directions of each test by their names.
+    """Return the directions that each test examines, by the names of the test and the direction.
 
-    There are three kinds of tests:
+    A direction is a change of the predicted readings that a false effect may leave, see the head of
+    this module. There are three kinds of tests:
 
-    - For static loads, and for flight: the size of the response, its zero (static loads only) and
-      its slope over the span (with enough stations), for each place of the load.
-    - For static runs: a zero that all channels of one quantity have in common.
-    - For the channel of an effect that acts on this channel alone: the size of its response for
-      each kind of trial and place of the load, and a drift of its zero over the campaign.
+    - "static loads" and "loads of flight" (`_add_load_directions`). At each place of a static load,
+      and in flight, another amplitude of the response, or a slope over the span if there are enough
+      stations. At a static load also an offset with the pattern of the response.
+    - "zeros of the static runs" (`_add_run_zeros`). In each run, an offset that all channels of one
+      quantity have in common.
+    - "channel NAME" (`_add_channel_directions`), for each effect that acts on one channel alone.
+      Another amplitude of the channel's response, for each kind of trial or place of a static load,
+      and an offset that grows in proportion to the start of the trial.
     """
     groups = _DirectionGroups()
     channels_of_effects = _channels_of_effects(problem, fit)
-    last_start = max(abs(data.trial.start) for data in problem.trials) or 1.0
+    latest_start = max(abs(data.trial.start) for data in problem.trials)
+    if latest_start == 0.0:
+        latest_start = 1.0  # all trials begin at zero: there is no drift, whatever its divisor
     for trial_index, data in enumerate(problem.trials):
         response = _predicted_response(problem, fit, trial_index)
         if data.trial.kind in (TrialKind.STATIC, TrialKind.FLIGHT):
@@ -322,8 +328,10 @@ def directions_by_test(
             _add_run_zeros(groups, problem, trial_index)
         for channel in channels_of_effects:
             if channel in data.trial.channels:
-                _add_channel_directions(groups, problem, trial_index, channel, response, last_start)
-    return groups.groups
+                _add_channel_directions(
+                    groups, problem, trial_index, channel, response, latest_start
+                )
+    return groups.by_test
 
 
 def _add_load_directions(
@@ -367,11 +375,11 @@ def _add_channel_directions(
     trial_index: int,
     channel: str,
     response: FloatArray,
-    last_start: float,
+    latest_start: float,
 ) -> None:
     """Add the directions of one channel in a trial: the size of its response (N, C), and a drift.
 
-    The drift is proportional to the start of the trial [s]. At `last_start` it is as large as the
+    The drift is proportional to the start of the trial [s]. At `latest_start` it is as large as the
     common zero of all channels of the same quantity, see `_zero_scale`.
     """
     data = problem.trials[trial_index]
@@ -383,7 +391,7 @@ def _add_channel_directions(
         trials_text = _load_place_text(data)
     group = f"channel {channel}"
     groups.add_change(group, f"the size {trials_text}", trial_index, response * is_channel)
-    drift = zero * data.trial.start / last_start * np.ones(response.shape) * is_channel
+    drift = zero * data.trial.start / latest_start * np.ones(response.shape) * is_channel
     groups.add_change(group, "the zero over time", trial_index, drift)
 
 

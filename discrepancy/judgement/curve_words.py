@@ -98,7 +98,8 @@ def _friction_in_words(
     count = min(len(resistance) for resistance in resistances)
     if count < LEAST_POINTS_OF_FRICTION:
         return _growth("velocity", velocities, forces)
-    # the mean of both directions, from rest to the largest velocity
+    # The mean of both directions, from the slowest points to the fastest. The k-th slowest points
+    # of both are taken as a pair: their speeds are nearly equal if both ranges of velocity are.
     mean_resistance = 0.5 * (resistances[0][:count] + resistances[1][:count])
     speeds = np.sort(np.abs(velocities[velocities > 0.0]))[:count]
     peak = int(np.argmax(mean_resistance))

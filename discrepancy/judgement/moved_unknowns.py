@@ -301,22 +301,23 @@ def _moved_texts(unknowns: Sequence[MovedUnknown]) -> str:
 def _moved_text(unknown: MovedUnknown) -> str:
     """Return in words the stated and fitted value of an unknown, and their distance.
 
-    The value of a gain is its relative error. A zero is stated as 0 with a standard deviation.
+    The distance is in standard deviations of the stated value. The value of a gain is its relative
+    error. If the stated value is 0, as for gains and zeros, only its standard deviation is given.
     """
     name = unknown.name
     value = unknown.value
     stated_deviation = unknown.deviation
-    distance = f"{abs(unknown.deviations):.1f} deviations"
+    distance_text = f"{abs(unknown.deviations):.1f} deviations"
     unit = "" if unknown.unit == "1" else f" {unknown.unit}"
     if name.startswith(GAIN_OF):
         stated_text = f"stated to {100.0 * stated_deviation:.3g} %"
-        return f"the {name} by {100.0 * value:+.3g} % ({stated_text}; {distance})"
+        return f"the {name} by {100.0 * value:+.3g} % ({stated_text}; {distance_text})"
     if unknown.stated == 0.0:
         factor = 1.0
         if name.startswith(ZERO_OF) and unknown.unit == UNITS[Quantity.STRAIN].si:
             factor, strain_unit = UNITS[Quantity.STRAIN].drawn
             unit = f" {strain_unit}"
         stated_text = f"stated to {factor * stated_deviation:.3g}{unit}"
-        return f"the {name} to {factor * value:.3g}{unit} ({stated_text}; {distance})"
+        return f"the {name} to {factor * value:.3g}{unit} ({stated_text}; {distance_text})"
     stated_text = f"{unknown.stated:.4g} ± {stated_deviation:.2g}"
-    return f"{name!r} from {stated_text} to {value:.4g}{unit} ({distance})"
+    return f"{name!r} from {stated_text} to {value:.4g}{unit} ({distance_text})"

@@ -208,8 +208,9 @@ def _group_outcome(
 ) -> VerdictOutcome:
     """Return the verdict that one of several hypotheses is true, and the data do not show which.
 
-    The members are given the best one first, with the probability that one of them is true. The
-    sentence begins with the effects that all of them have in common.
+    `members` are these hypotheses, the best one first, and `probability` is that of one of them
+    being true. If some effects are in all of them, the sentence first says that these are missing.
+    The gate in the verdict is that of the best one.
     """
     effects_by_member = [named_effects(comparison.problem, member) for member in members]
     sentence = _group_sentence(comparison, members, effects_by_member, probability)
@@ -223,9 +224,10 @@ def _group_outcome(
     all_effects: list[NamedEffect] = []
     for effects in effects_by_member:
         all_effects.extend(effects)
-    group = []
+    member_names = []
     for member in members:
-        group.append(" + ".join(sorted(names_without_free_shape(member.candidate.identifiers))))
+        effect_names = sorted(names_without_free_shape(member.candidate.identifiers))
+        member_names.append(" + ".join(effect_names))
     return _outcome(
         comparison,
         VerdictKind.GROUP,
@@ -235,7 +237,7 @@ def _group_outcome(
         judged_hypothesis=members[0],
         members=members,
         effects=tuple(all_effects),
-        group=tuple(group),
+        group=tuple(member_names),
         gates=(comparison.absolute_fit(members[0]),),
     )
 

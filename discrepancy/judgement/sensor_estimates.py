@@ -53,6 +53,7 @@ def sensor_estimates(problem: Problem, fit: CandidateFit) -> tuple[SensorEstimat
         The fit, with the posterior covariance of what the trials share.
     """
     estimates = _gain_estimates(problem, fit)
+    # estimated over recorded noise precision of each channel; 1 with a noise record
     precision_ratios = problem.recorded_or_estimated_precisions(fit.squares_by_channel)
     for trial_index in range(len(problem.trials)):
         estimates += _zero_offset_estimates(problem, fit, trial_index, precision_ratios)

@@ -93,7 +93,9 @@ class SimulationComparison(Comparison[CandidateFit]):
     def _compute_gap_share(self, hypothesis: CandidateFit, *, held_out: bool) -> GapShare:
         """Return the share of the gap between readings and simulation that a hypothesis explains.
 
-        Squared residuals are summed over blocks of the records, for the bootstrap of the share.
+        Squared residuals, in noise variances, are summed over blocks of the records for the
+        bootstrap of the share. The result also has the rms of the gap beyond the noise, without
+        effect and with the hypothesis, in noise deviations.
         """
         residuals_before = self.search.residuals(self.search.no_effect)
         residuals_after = self.search.residuals(hypothesis)
@@ -104,6 +106,7 @@ class SimulationComparison(Comparison[CandidateFit]):
             blocks += self._block_sums(trial_before, trial_after)
         sums_before = np.array([block.squares_without_effect for block in blocks])
         sums_after = np.array([block.squares_with_effect for block in blocks])
+        # noise has a variance of one in these units: its expected sum of squares is the count
         noise_sums = np.array([block.sample_count for block in blocks])
         return GapShare(
             squares_before=sums_before,
@@ -114,7 +117,7 @@ class SimulationComparison(Comparison[CandidateFit]):
             remaining_rms=_rms_beyond_noise(sums_after, noise_sums),
             total_rms=_rms_beyond_noise(sums_before, noise_sums),
             kind=OF_READINGS,
-            is_tested=True,
+            is_tested=True,  # the size of the law's force is not examined here
         )
 
     def _block_sums(self, trial_before: FittedTrial, trial_after: FittedTrial) -> list[_BlockSums]:
@@ -218,10 +221,12 @@ class SimulationComparison(Comparison[CandidateFit]):
         self.search.wide_fits = compared
 
     def _single_laws_like(self, best_fit: CandidateFit) -> list[CandidateFit]:
-        """Return fits of the single laws that are easily mistaken for the best one.
+        """Return fits of single laws to repeat with a free shape: the best law and related ones.
 
-        For each family and place it is the one with the highest score. Only laws with a shape
-        parameter that is not free yet count; the best law is one of them if it has one.
+        Related laws are those that are easily mistaken for the best one (`are_related`), at any
+        place. Laws without a shape parameter, or whose shape is free already, are left out, be it
+        the best law itself. Of several fits of a family at a place, the one with the highest score
+        is returned.
         """
         (best_term,) = best_fit.candidate.terms
         single_fits: dict[tuple[str, str], CandidateFit] = {}

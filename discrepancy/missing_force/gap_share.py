@@ -41,7 +41,8 @@ class GapShare:
         `OF_PREDICTIONS` (changes of the readings within a block by the missing forces in it), or
         `OF_READINGS` (differences between readings and simulation).
     is_tested : bool
-        Whether the force of the law is so large in these trials that they test it.
+        Whether the force of the law is so large in these trials that they test it. It is always
+        true for a hypothesis without a law at a port, and for `OF_READINGS`.
     """
 
     squares_before: FloatArray

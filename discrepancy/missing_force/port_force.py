@@ -183,7 +183,7 @@ def relaxed_displacement(time: FloatArray, speed: FloatArray, relaxation_time: f
 
 @dataclass(frozen=True, eq=False)
 class TrialForce:
-    """The missing force in one trial, at its samples.
+    """The force that the model lacks in one trial, at its samples.
 
     Attributes
     ----------
@@ -196,7 +196,8 @@ class TrialForce:
     variables : mapping of str to (N,) array
         Further variables that the force may follow, see `explanatory_variables` [SI].
     force, deviation : (N,) array
-        The smoothed force, and its posterior standard deviation [N, N m or the port's flow].
+        The smoothed force, that of a law included, and the posterior standard deviation of the part
+        that no law explains [N, N m or the port's flow].
     law : (N,) array or None
         The force of the effect in the verdict along the same motion; None if it has no law here.
     """
@@ -283,8 +284,9 @@ def _forces_by_trial(
 ) -> list[TrialForce]:
     """Return the force that the model lacks at a port in each trial, with the motion of the port.
 
-    `port` is the number of the port, and `recorded` has the trials as they were recorded, by name.
-    With `has_law`, the result has the force of the hypothesis' law at the port, too.
+    The model lacks the force of the hypothesis' law and the missing force, which no law explains.
+    With `has_law`, the result also has the force of the law by itself. `port` is the number of the
+    port, and `recorded` has the trials as they were recorded, by name.
     """
     trial_forces = []
     for smoothed_trial in estimate.trials:
@@ -298,6 +300,7 @@ def _forces_by_trial(
                 position=smoothed_trial.trajectory.positions[samples, port],
                 speed=smoothed_trial.trajectory.speeds[samples, port],
                 variables=_inputs_and_rates(recorded[trial.name], trial.stride),
+                # the law's force counts as exact: the deviation is that of the missing force alone
                 force=smoothed_trial.lacking_forces[port][samples],
                 deviation=smoothed_trial.missing_force_deviations[port][samples],
                 law=law_force,

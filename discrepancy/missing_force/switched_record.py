@@ -444,16 +444,15 @@ def initial_covariances(system: ForceStateSpace, event_state: int) -> tuple[Floa
     system : ForceStateSpace
         The state space with the force on.
     event_state : int
-        The index of the force of events in the state.
+        The index of the force of events in the state, after all states of the structure.
     """
     covariance_on = system.initial_covariance
-    # A settled trial begins at rest, deflected by the force. Without the force that part of the
-    # covariance is absent.
+    # In a trial that begins at rest, the force of events f deflects the states of the structure by
+    # h f. As f has variance one, h is their covariance with f, and h h^T is what f adds to their
+    # own covariance. With the force off, that is subtracted.
     covariance_off = covariance_on.copy()
-    covariance_with_event = covariance_on[:event_state, event_state]
-    covariance_off[:event_state, :event_state] -= np.outer(
-        covariance_with_event, covariance_with_event
-    )
+    deflection = covariance_on[:event_state, event_state]
+    covariance_off[:event_state, :event_state] -= np.outer(deflection, deflection)
     return zero_state(covariance_off, event_state), covariance_on
 
 
