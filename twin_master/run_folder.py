@@ -372,12 +372,15 @@ def hold_run_folder(
 ) -> Iterator[LockedRun]:
     """Lock the folder of an earlier run or watch, to continue it.
 
+    The folder is locked until the context ends.
+
     Parameters
     ----------
     loaded_scenario : LoadedScenario or None
         The scenario that the user expects there; it is compared with that of the folder.
     fleet_is_locked : bool
-        See `create_run_folder`.
+        Whether this process watches the fleet that the folder belongs to, and has locked the
+        fleet's folder. The folder itself is then locked only for a moment.
 
     Raises
     ------
@@ -398,6 +401,8 @@ def hold_run_folder(
     with ExitStack() as locks:
         locks.enter_context(closing_lock(lock_run_folder(folder, fleet_is_locked=fleet_is_locked)))
         if fleet_is_locked:
+            # No other process had the lock, and none can take it while the fleet is locked. A lock
+            # kept for each asset would limit their number by the files that may be open.
             locks.close()
         yield LockedRun(config, scenario.with_paths_from(folder))
 

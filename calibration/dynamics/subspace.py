@@ -215,6 +215,9 @@ class Subspace:
     ) -> list[Float]:
         """Return the modal values of P poles after a small change of the correlations.
 
+        The modal values are natural frequency, damping ratio and relative mode shape, as
+        `IdentifiedPoles.modal_values` defines them.
+
         Parameters
         ----------
         change : (2 L, C, C) array
@@ -224,13 +227,19 @@ class Subspace:
         poles : (P,) array
             The poles before the change [1/s]. Each is matched with the nearest pole after the
             change.
+
+        Returns
+        -------
+        list of (1 + A,) array
+            The modal values of each of the P poles.
         """
         realisation = self._realisation(self._correlation + change, self._basis(order))
-        nearest_pole = np.argmin(np.abs(realisation.pole - poles[:, None]), axis=1)
+        # `realisation.pole` holds all n poles, `realisation.shape` their mode shapes in columns
+        nearest = np.argmin(np.abs(realisation.pole - poles[:, None]), axis=1)
         not_needed = np.ones(len(poles))
         changed_poles = IdentifiedPoles(
-            pole=realisation.pole[nearest_pole],
-            shape=realisation.shape.T[nearest_pole],
+            pole=realisation.pole[nearest],
+            shape=realisation.shape.T[nearest],
             contribution=not_needed,
             chi_square=not_needed,
             frequency_count=1,

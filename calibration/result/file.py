@@ -277,8 +277,12 @@ def description(calibration: Calibration) -> str:
 
 
 def plain_record(calibration: Calibration) -> dict[str, object]:
-    """Return a calibration as plain data: quantities with intervals, and correlations."""
-    records = {
+    """Return a calibration as plain data: quantities with intervals, and correlations.
+
+    The key `state` has the calibrated parameters, which have priors; `quantities` has the further
+    quantities, which follow from them. `CalibrationRecord` describes all keys.
+    """
+    record_of_quantity = {
         quantity.name: {
             "title": quantity.title,
             "unit": quantity.unit,
@@ -288,6 +292,7 @@ def plain_record(calibration: Calibration) -> dict[str, object]:
         }
         for quantity in calibration.all_quantities
     }
+    # `all_quantities` are the parameters, then the quantities
     parameters = [prior.name for prior in calibration.priors]
     quantities = [quantity.name for quantity in calibration.quantities]
     field_names = ("asset", "procedure", "seed", "model", "design_hash")
@@ -298,8 +303,8 @@ def plain_record(calibration: Calibration) -> dict[str, object]:
         "calibration_sha256": hash_bytes(result_bytes(calibration)),
         "campaign" if calibration.design is None else "laboratory": calibration.source,
         "findings": list(calibration.findings),
-        "state": {name: records[name] for name in parameters},
-        "quantities": {name: records[name] for name in quantities},
+        "state": {name: record_of_quantity[name] for name in parameters},
+        "quantities": {name: record_of_quantity[name] for name in quantities},
         "correlation": {"names": parameters, "matrix": calibration.correlation.tolist()},
         # JSON is written with sorted keys; pages list the quantities in the order of the
         # calibration.

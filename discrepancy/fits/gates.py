@@ -182,14 +182,13 @@ def prior_tests(problem: Problem, fit: CandidateFit) -> list[NamedTest]:
 def whiteness_tests(problem: Problem, fit: CandidateFit) -> list[NamedTest]:
     """Return for each channel the test of whether its residuals are white (Ljung-Box).
 
-    The records of a channel in all trials in motion are tested together. A channel is left out if
-    its noise record is not white, or if the process in its residuals has the correlation of the
-    noise record.
+    The residuals of a channel in all dynamic trials are tested together. A channel is left out if
+    its noise record is not white, or if its residuals are correlated in time as that record is.
     """
     tests = []
-    # the factor differs from 1 if the residuals are fitted with the correlation of the noise record
-    has_white_residuals = _recorded_colour_factor(problem, fit) == 1.0
-    for channel in np.flatnonzero(has_white_residuals).tolist():
+    # `_recorded_colour_factor` is 1 unless residuals have the correlation of the noise record
+    may_be_white = _recorded_colour_factor(problem, fit) == 1.0
+    for channel in np.flatnonzero(may_be_white).tolist():
         if not problem.is_whiteness_tested[channel]:
             continue
         records = residual_records(problem, fit, channel)

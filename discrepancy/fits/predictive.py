@@ -91,24 +91,25 @@ def fit_held_out(
 
 
 RELEASE_AMPLITUDES = tuple(np.linspace(-2.0, 2.0, 17).tolist())
-"""Amplitudes of a release from which the fit of a held-out trial may begin, relative to the nominal
-one: in prior deviations, or for a free initial state in tenths of the nominal amplitude."""
+"""Differences from the nominal amplitude of a release at which the fit of a held-out trial may
+begin: in prior deviations, or for a free initial state in tenths of the nominal amplitude."""
 
 
 def _with_best_release_amplitudes(held_out: Problem, candidate: Candidate, start: Point) -> Point:
-    """Return the start with the best release amplitude of each trial, from a grid.
+    """Return the start, in which each release has the amplitude of least objective on a grid.
 
-    The best amplitude has the least objective. If friction ends a motion, there is one optimum for
-    each number of half swings, and a descent finds only the nearest one.
+    The amplitude is that of the first released mode. If friction ends a motion, there is one
+    optimum for each number of half swings, and a descent finds only the nearest one.
     """
     best_local = list(start.local)
     for trial_index, data in enumerate(held_out.trials):
         release = data.trial.release
-        amplitude_index = data.unknowns.zero_count
+        amplitude_index = data.unknowns.indices.initial_state.start
         if release is None or amplitude_index >= data.unknowns.unknown_count:
             continue
-        # For a release from rest the unknown is the difference from the nominal amplitude. The
-        # amplitude of a free initial state is nominal at the scaled value 1 / scale.
+        # The unknown is scaled by its prior deviation. For a release from rest it is the difference
+        # from the nominal amplitude. For a free initial state it is the amplitude itself, in units
+        # of the nominal one: there the nominal amplitude 1 has the scaled value 1 / deviation.
         nominal_amplitude = 0.0
         amplitude_step = 1.0
         if not release.at_rest:

@@ -239,9 +239,10 @@ class Problem:
         patch: ModelPatch,
         refinement: int = 1,
     ) -> tuple[FloatArray, FloatArray | None]:
-        """Return the response of a patched model in a trial, without gains and zeros of channels.
+        """Return the response of a patched model in a trial, as ideal sensors would read it.
 
-        The last responses are kept in memory, at most `MOST_CACHED_RESPONSES`.
+        Gain errors and zero offsets of the channels are not applied. The last responses are kept in
+        memory, at most `MOST_CACHED_RESPONSES`.
 
         Parameters
         ----------
@@ -250,9 +251,10 @@ class Problem:
         local_values : (L,) array
             The scaled unknowns of the trial.
         patch : ModelPatch
-            The change of the model by effects.
+            What a hypothesis changes in the model: the primitives of its effects.
         refinement : int
-            The factor by which the time steps of the problem are divided.
+            The time steps are this many times smaller than those of the problem, which are already
+            divided by its own `refinement`.
 
         Returns
         -------

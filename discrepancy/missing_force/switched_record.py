@@ -257,19 +257,24 @@ class SwitchedRecord:
         )
 
     def _steps_at_ends(self, is_on: BoolArray, ends: IntArray) -> tuple[FloatArray, FloatArray]:
-        """Return transitions and noises (B, n, n) of the steps that lead out of inverted stretches.
+        """Return the matrices of the steps that end B stretches of the path, each tried inverted.
 
-        For example, if a force that was off is tried as on, this step turns it off.
+        The step leads from the last sample of a stretch, at which the path is inverted (on for off,
+        off for on), to the next sample, at which it is not. A stretch up to the end of the record
+        has no such step: its transition is the identity, without noise.
 
         Parameters
         ----------
         is_on : (N,) array of bool
-            The path before a stretch is inverted.
+            The path before an inversion: whether the force is on at each sample.
         ends : (B,) array of int
-            The sample after the last one of each stretch. No step leads out of the record: there
-            the transition is the identity, without noise.
+            The sample after the last one of each stretch; N at the end of the record.
+
+        Returns
+        -------
+        transitions, noises : (B, n, n) array
+            The transition matrix and noise covariance of each step, for the n filtered states.
         """
-        # the path is inverted up to the sample before the end, and not at the end
         is_last = ends == len(is_on)
         end_sample = np.where(is_last, 0, ends)  # any sample: the last ones are replaced below
         inverted_before_end = ~is_on[ends - 1]

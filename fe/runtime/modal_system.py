@@ -304,7 +304,7 @@ def _exact_steps(stiffness: bytes, damping: bytes, lengths: bytes) -> ExactSteps
     """Return the exact time steps of M coordinates under forces that are linear in time.
 
     The arguments are the bytes of float64 arrays, since the cache needs arguments with a hash:
-    the stiffness S (M, M), or its diagonal if nothing couples the coordinates [1/s^2]; the damping
+    the stiffness K (M, M), or its diagonal if nothing couples the coordinates [1/s^2]; the damping
     D (M, M) [1/s]; and the lengths (S,) [s].
     """
     stiffness_values = np.frombuffer(stiffness)
@@ -346,15 +346,27 @@ def _exact_steps(stiffness: bytes, damping: bytes, lengths: bytes) -> ExactSteps
 def _linear_force_exponentials(
     stiffness: FloatArray, damping: FloatArray, lengths: FloatArray
 ) -> ExactSteps:
-    """Return the exact time steps of B independent systems, each of n coordinates.
+    """Return the exact time steps of B independent systems, each of n coordinates of unit mass.
 
-    The state (q, v) is extended by the force f and its change s over the step. So the equation of
-    motion becomes homogeneous, and one matrix exponential solves it (Van Loan 1978). Stiffness and
-    damping are arrays (B, n, n); the results are arrays (S, B, 2n, 2n) and (S, B, 2n, n).
+    The equation of motion is q'' + D q' + K q = f, with a force f that is linear in time over each
+    step. The state (q, v) is extended by the force f and its change s over the step. So the
+    equation becomes homogeneous, and one matrix exponential solves it (Van Loan 1978).
+
+    Parameters
+    ----------
+    stiffness, damping : (B, n, n) array
+        The stiffness K [1/s^2] and the damping D [1/s] of each system.
+    lengths : (S,) array
+        The lengths of the steps [s].
+
+    Returns
+    -------
+    ExactSteps
+        `transition` is (S, B, 2n, 2n), `begin` and `end` are (S, B, 2n, n).
     """
     count = stiffness.shape[1]
     unity = np.eye(count)
-    # speeds in units of the highest frequency, which balances the matrix
+    # q, v / w, f and s have a matrix of balanced entries, with w about the highest frequency
     largest_stiffness = np.abs(stiffness).max(axis=(1, 2), keepdims=True)
     largest_damping = np.abs(damping).max(axis=(1, 2), keepdims=True)
     highest_frequency = np.maximum(np.sqrt(largest_stiffness), largest_damping)
@@ -362,22 +374,22 @@ def _linear_force_exponentials(
     speed_unit = np.maximum(highest_frequency, 1.0 / longest_step)
     q, v, f, s = (slice(number * count, (number + 1) * count) for number in range(4))
     state = slice(0, 2 * count)
-    # the matrix of the extended state
+    # the time derivative of (q, v / w, f, s), without that of f
     matrix = np.zeros((len(stiffness), 4 * count, 4 * count))
     matrix[:, q, v] = speed_unit * unity
     matrix[:, v, q] = -stiffness / speed_unit
     matrix[:, v, v] = -damping
     matrix[:, v, f] = unity / speed_unit
     step_matrix = matrix * lengths[:, None, None, None]
-    step_matrix[:, :, f, s] = unity  # the force changes by one over the step
+    step_matrix[:, :, f, s] = unity  # df / dt = s / h, times the length h
     result = exponential(step_matrix)
-    # back to the units of the state
+    # back from v / w to v: factors 1 on the n coordinates and w on the n speeds, (B, 2n, 1)
     units = np.concatenate((np.ones_like(speed_unit), speed_unit), axis=1)
     scale = units.repeat(count, axis=1)
     by_change = result[:, :, state, s] * scale
     by_constant = result[:, :, state, f] * scale
-    # A linear force is its value at the begin times (1 - t / h) plus its value at the end times
-    # t / h: the response to the first part is that to a constant minus that to the change.
+    # The force is f_begin (1 - t / h) + f_end (t / h). The state responds to 1 - t / h as to the
+    # constant 1 minus the change t / h.
     transition = result[:, :, state, state] * scale / scale.transpose(0, 2, 1)
     return ExactSteps(
         transition=np.ascontiguousarray(transition),

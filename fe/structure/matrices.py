@@ -343,9 +343,10 @@ def _check_definite(matrix: sparse.csr_array, refusal: str) -> None:
 
 
 def _check_structure(stiffness: sparse.csr_array, mass: sparse.csr_array, dofs: list[Dof]) -> None:
-    """Raise `MeshError` if the free matrices (m, m) are not those of a structure at rest.
+    """Raise `MeshError` if matrices (m, m) of the free rows cannot be those of a held structure.
 
-    The stiffness must be positive definite, and the mass positive semidefinite.
+    The stiffness must be positive definite and not nearly singular. The mass must be positive
+    semidefinite, but for a tolerance of 1e-6 of its diagonal.
     """
     stiffness_diagonal = stiffness.diagonal()
     mass_diagonal = mass.diagonal()
@@ -360,13 +361,17 @@ def _check_structure(stiffness: sparse.csr_array, mass: sparse.csr_array, dofs: 
         "mass but no stiffness: hold it, or give it stiffness",
     )
     _check_rows(dofs, mass_diagonal < 0.0, "a negative mass")
+    # The factorisation fails if the stiffness is not positive definite. If it is nearly singular,
+    # rounding errors may let it succeed. But a random load moves all weakly held motions, and
+    # `solve` raises the error, since the solution is inaccurate.
     try:
         Factorisation(stiffness).solve(np.random.default_rng(16).standard_normal(len(dofs)))
     except SolutionError:
         _refuse_singular(stiffness, dofs)
-    floor = np.where(mass_diagonal > 0.0, mass_diagonal, mass_diagonal.mean() or 1.0)
+    # a small mass is added to each row, so that massless rows pass the test of definiteness
+    row_mass = np.where(mass_diagonal > 0.0, mass_diagonal, mass_diagonal.mean() or 1.0)
     _check_definite(
-        mass + sparse.diags_array(1e-6 * floor),
+        mass + sparse.diags_array(1e-6 * row_mass),
         "the mass matrix is indefinite: some motion of the structure has negative mass.",
     )
 

@@ -67,7 +67,9 @@ class MatrixFiles:
     def rows_of(self, dof: Dof, where: str) -> list[int]:
         """Return the rows of a component of a node.
 
-        `where` is the key of the design that names the node, for the error message.
+        There may be several: CalculiX expands a node of a shell or a beam into two to eight nodes,
+        whose rows have the same node and component. `where` is the key of the design that names the
+        node, for the error message.
 
         Raises
         ------
@@ -77,7 +79,11 @@ class MatrixFiles:
         if dof in self.rows:
             return self.rows[dof]
         node, component = dof
-        components = [str(other) for number, other in sorted(self.rows) if number == node]
+        components = [
+            str(known_component)
+            for known_node, known_component in sorted(self.rows)
+            if known_node == node
+        ]
         known_rows = f"its components {', '.join(components)}" if components else "no such node"
         raise MeshError(
             f"{where}: node {node} has no component {component} in the matrices, which have "

@@ -375,16 +375,17 @@ def _refuse_continuation(line: _Line) -> NoReturn:
 
 
 def _fields(where: str, text: str) -> list[str]:
-    """Split a line into its keyword, four or eight values, and its continuation marker.
+    """Split a line of Nastran bulk data into its keyword, values and continuation marker.
 
     The line is in free format, with commas, or in fixed format, in columns of 8 or 16 characters.
+    It has eight values, or four if its keyword has a `*`. Absent fields are empty texts.
     """
     if "," not in text:
         return _fields_in_columns(text)
     fields = [field.strip() for field in text.split(",")]
     marker = fields.pop() if _MARKER.match(fields[-1]) else ""
     value_count = 4 if "*" in fields[0] else 8
-    most_fields = value_count + 2  # beside the values the word and the marker
+    most_fields = value_count + 2  # the keyword, the values and the marker
     if len(fields) > most_fields:
         fail(
             where,

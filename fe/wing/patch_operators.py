@@ -154,21 +154,20 @@ def area_weights(stations: FloatArray, root_chord: float, tip_chord: float) -> F
 
 
 def section_lines(design: WingDesign) -> tuple[float, ...]:
-    """Return the chord fractions of the elastic line, then of the webs that are other lines.
+    """Return the chord fractions of the lines that carry the forces on a section.
 
-    The webs are in ascending order. A web closer to another line than `LEAST_LINE_DISTANCE` is
-    left out, since a moment would need large opposite forces on a short lever. The webs are tried
-    from the elastic line outwards, so that of two webs close together the inner one is kept.
+    The elastic line comes first, then webs in ascending order. A web closer to another line than
+    `LEAST_LINE_DISTANCE` is left out, since a moment would need large opposite forces on a short
+    lever. The webs are tried from the elastic line outwards: of two that are close together, the
+    one nearer to the elastic line is kept.
     """
-    elastic_chord = design.tip_load.chord
-    web_chords = sorted(
-        (web.chord for web in design.webs), key=lambda chord: abs(chord - elastic_chord)
-    )
-    lines = [elastic_chord]
-    for chord in web_chords:
-        if min(abs(chord - line) for line in lines) >= LEAST_LINE_DISTANCE:
-            lines.append(chord)
-    return elastic_chord, *sorted(lines[1:])
+    elastic_line = design.tip_load.chord
+    webs = sorted((web.chord for web in design.webs), key=lambda web: abs(web - elastic_line))
+    lines = [elastic_line]
+    for web in webs:
+        if min(abs(web - line) for line in lines) >= LEAST_LINE_DISTANCE:
+            lines.append(web)
+    return elastic_line, *sorted(lines[1:])
 
 
 def assemble_patch_operators(operators: AffineOperators) -> PatchOperators:

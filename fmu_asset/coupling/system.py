@@ -73,11 +73,16 @@ class _SystemVariable(NamedTuple):
 def system_description(wiring: Wiring, sha256: str = "") -> SystemDescription:
     """Return a system as the description of one FMU, all of whose variables are real numbers.
 
-    An output that a connector exposes is a local variable of the system. Ranges and types of inputs
-    are left out, since the components check them.
+    The variables are the connectors of the system, then the variables of its components. Texts,
+    arrays and clocked variables of components are left out. A component's output to which an output
+    of the system is connected becomes local. Ranges and types of inputs are left out, since the
+    components check them.
 
     Parameters
     ----------
+    wiring : Wiring
+        The checked system: `structure` lists its connectors, `ends` the components' variables
+        behind each connector, and `declared` the description of each component's FMU.
     sha256 : str
         A hash of everything that the meaning of a saved state depends on, see `wiring_hash`.
     """
@@ -85,16 +90,18 @@ def system_description(wiring: Wiring, sha256: str = "") -> SystemDescription:
     system_variables = [
         _connector_variable(wiring, connector) for connector in structure.connectors
     ]
-    shown_ends: set[Endpoint] = set()
+    exposed_outputs: set[Endpoint] = set()
     for connector in structure.connectors:
         if connector.kind == "output":
-            shown_ends.update(port.end for port in wiring.ends[connector.name])
+            exposed_outputs.update(port.end for port in wiring.ends[connector.name])
     for component, description in wiring.declared.items():
         for info in description.variables:
-            if info.single:
-                end = Endpoint(component, info.name)
-                variable = _component_variable(wiring, end, info, is_shown=end in shown_ends)
-                system_variables.append(variable)
+            if not info.single:  # a text, an array or a clocked variable
+                continue
+            end = Endpoint(component, info.name)
+            is_exposed = end in exposed_outputs
+            variable = _component_variable(wiring, end, info, is_exposed=is_exposed)
+            system_variables.append(variable)
     variables = []
     ends: dict[str, tuple[ConnectedVariable, ...]] = {}
     definitions: dict[str, tuple[UnitInfo, ...]] = {}
@@ -147,13 +154,13 @@ def _connector_variable(wiring: Wiring, connector: Connector) -> _SystemVariable
 
 
 def _component_variable(
-    wiring: Wiring, end: Endpoint, info: VariableInfo, *, is_shown: bool
+    wiring: Wiring, end: Endpoint, info: VariableInfo, *, is_exposed: bool
 ) -> _SystemVariable:
-    """Return a component's variable as one of the system; local if a connector exposes it."""
+    """Return a component's variable as one of the system; local if an output exposes it."""
     causality = info.causality
     if end in wiring.feeds:
         causality = "an input that is fed by a connection already"
-    elif is_shown:
+    elif is_exposed:
         causality = "local"
     system_info = VariableInfo(
         name=str(end),

@@ -190,10 +190,10 @@ class Slave:
 
     def _check_ranges(self, checked_rows: int, consequence: str) -> bool:
         """Return whether values lie in their ranges; pass tunable values to the behaviour."""
-        if not self._in_range(0, checked_rows, consequence):
+        if not self._check_rows(0, checked_rows, consequence):
             return False
         if self._tunable:
-            if not self._in_range(self._end_of_outputs, len(self._values), consequence):
+            if not self._check_rows(self._end_of_outputs, len(self._values), consequence):
                 return False
             values = {name: self._values[number] for name, number in self._tunable.items()}
             self._behaviour.tune(values, self._start_time)
@@ -345,11 +345,11 @@ class Slave:
 
     # ------------------------------------------------------------------ refusals
 
-    def _in_range(self, first: int, end: int, consequence: str) -> bool:
-        """Return whether the values of rows lie in their ranges; refuse the first that does not.
+    def _check_rows(self, first: int, end: int, consequence: str) -> bool:
+        """Refuse the call if a value is not finite or outside its range; return whether all are in.
 
-        Rows are counted from `first` to before `end`. `consequence` says in the message what the
-        refusal means.
+        The rows from `first` to before `end` are checked, up to the first fault. The message ends
+        with `consequence`: what happens because the call is refused.
         """
         values = self._values
         for index in range(first, end):

@@ -208,7 +208,7 @@ class AssetAndModel:
 def calibration_sentence(
     record: JsonRecord, asset: str, believed: str, hashes: Mapping[str, str]
 ) -> str | None:
-    """Return a sentence on which model was calibrated, and whether the twin believes that model.
+    """Return two sentences: which model was calibrated, and whether the twin believes its design.
 
     Parameters
     ----------
@@ -216,23 +216,34 @@ def calibration_sentence(
         The record of the calibration that a run folder contains.
     asset, believed : str
         The asset that flies and the model that the twin believes, in words.
+    hashes : mapping of str to str
+        The hashes of the inputs by their names, as `AssetSource.prepare` returns them. The believed
+        design is `design`, and the design that flies is `FLOWN_DESIGN_HASH`; either may be absent.
 
     Returns
     -------
     str or None
-        The sentence; None if the calibration does not come from a measurement campaign.
+        The sentences; None if the calibration does not come from a measurement campaign.
     """
     if "campaign" not in record:
         return None
     roles = f"asset and belief are the {asset}"
     if asset != believed:
         roles = f"the asset is the {asset}, and the twin believes the {believed}"
+    calibrated_hash = record.get("design_hash")  # empty if the file does not say it
     # Without a believed design of its own, the twin believes the asset's.
     believed_hash = hashes.get("design", hashes.get(FLOWN_DESIGN_HASH))
-    if believed_hash is not None and believed_hash == record.get("design_hash"):
+    # A library that the twin believes may come from another design than that which flies.
+    is_belief_certain = "design" in hashes or asset == believed
+    if believed_hash is not None and believed_hash == calibrated_hash:
         comparison = f"The twin believes the design that was calibrated, {believed_hash[:12]}."
+    elif believed_hash and calibrated_hash and is_belief_certain:
+        comparison = (
+            f"The twin believes the design {believed_hash[:12]}, which is not the one that was "
+            f"calibrated, {calibrated_hash[:12]}."
+        )
     else:
-        comparison = "The calibration file does not say whether these are one and the same."
+        comparison = "It is not known whether the twin believes the design that was calibrated."
     return f"The calibrated model was {record['model']}; {roles}. {comparison}"
 
 

@@ -136,10 +136,15 @@ class RecordedFeed(Feed):
         return file.open("rb", buffering=0)
 
     def messages(self, position: Position | None) -> Iterator[FeedItem]:
-        """Yield each message after a position, with the beginning of its text.
+        """Yield each message after a position of the file, with the beginning of its text.
 
-        The message is None if no further one has come yet. `position` advances before the last
-        message of each line.
+        While the file has no further line, (None, "") is yielded. `self.position` is moved to the
+        end of a line before the last message of the line is yielded, or if the line has none.
+
+        Parameters
+        ----------
+        position : Position or None
+            Where reading begins; None for the beginning of the file.
         """
         followed_path = self.path if self.follow else None
         lines = GrowingFile(self.open_file(position), position, followed_path)
@@ -159,7 +164,7 @@ class RecordedFeed(Feed):
             for message in messages[:-1]:
                 yield message, beginning_of(line)
             self.position = lines.position
-            for message in messages[-1:]:
+            for message in messages[-1:]:  # none if the line has no message
                 yield message, beginning_of(line)
 
     def release_file(self) -> None:

@@ -489,15 +489,19 @@ class Session:
         return bool(self.publishers) or bool(self._publisher_of_message)
 
     def _say_goodbye(self, client: "Client", state: str) -> None:
-        """Publish the last heartbeat with a state, "ended" or "lost", and disconnect in order."""
+        """Publish the last heartbeat, with the state "ended" or "lost", and disconnect properly.
+
+        The broker receives a message of disconnection, so that it does not take the connection for
+        broken.
+        """
         connection = client.socket()
         if connection is None:
             return
         last_heartbeat = json.dumps(self._heartbeat() | {"state": state})
         client.publish(self._heartbeat_topic, last_heartbeat, retain=True)
-        # The client closes its socket at once. If something has come that nobody has read, the
-        # system then resets the connection, and the broker may see that before the goodbye. So a
-        # copy of the socket is read until the broker closes the connection.
+        # `disconnect` closes the socket at once. If data from the broker are still unread then, the
+        # system resets the connection, and the broker may see the reset before the messages. So a
+        # copy of the socket stays open, and is read until the broker closes the connection.
         with suppress(OSError), socket.socket(fileno=os.dup(connection.fileno())) as copy:
             copy.settimeout(_GOODBYE_SECONDS)
             client.disconnect()

@@ -72,8 +72,10 @@ def log_of_sums(values: Float) -> Float:
 
 @dataclass
 class HypothesisWeights:
-    """Log weights of the hypotheses before or after an observation, for G gauges and K gain errors.
+    """Log weights of the hypotheses before or after an observation.
 
+    There are G gauges with K gain errors each. So there are 1 + G K faults: free gains of several
+    gauges, then each gauge with each gain error. Weights are joint log probabilities.
     All arrays may have a leading axis of twins.
 
     Attributes
@@ -84,8 +86,8 @@ class HypothesisWeights:
     hidden : (..., 1 + G K) array
         The log weights of the faults that do not show under it: free gains, then single gauges.
     showing : (..., 1 + G K, U) array
-        The probability that a fault shows under each control. That of the control in force is
-        contained in `current` and `hidden`.
+        The conditional probability that a fault, if there is one, shows under each of U controls.
+        That of the control in force is contained in `current` and `hidden`.
     """
 
     current: Float
@@ -131,7 +133,7 @@ class HypothesisWeights:
         Returns
         -------
         (B, 1 + G K) array
-            The probability of each fault that it showed before and is hidden now.
+            By how much the probability rises that there is each fault and it is hidden; at least 0.
         """
         newly_hidden = np.zeros_like(self.hidden)
         pairs = np.stack([previous_control, control], axis=1)
@@ -151,24 +153,27 @@ class HypothesisWeights:
     def change_control(self, previous_control: int, control: int) -> Float:
         """Divide each fault's probability anew into a showing and a hidden part.
 
-        Their sum stays the same. The weights are changed in place.
+        Their sum stays the same. What the readings told is kept in `showing` of the previous
+        control, and `showing` of the new control gives the new parts, in `current` and `hidden`.
 
         Parameters
         ----------
         previous_control, control : int
-            The controls before and after the change.
+            The indices of the controls before and after the change.
 
         Returns
         -------
         (..., 1 + G K) array
-            The probability of each fault that it showed before and is hidden now.
+            By how much the probability rises that there is each fault and it is hidden; 0 where it
+            falls. Faults are in the order of `hidden`.
         """
-        # Keep what was learnt under the previous control: p(showing | fault).
-        log_showing_before = self.current[..., FAULTS]
+        # joint log probabilities: of the fault and that it shows, and of the fault
+        log_fault_and_showing = self.current[..., FAULTS]
+        log_fault = np.logaddexp(log_fault_and_showing, self.hidden)
         hidden_before = np.exp(self.hidden)
-        log_fault = np.logaddexp(log_showing_before, self.hidden)
-        showing_probability = np.exp(log_showing_before - log_fault)
-        self.showing[..., previous_control] = np.clip(showing_probability, LEAST_SHOWING, 1.0)
+        # `showing` is conditional: p(showing | fault)
+        showing_if_fault = np.exp(log_fault_and_showing - log_fault)
+        self.showing[..., previous_control] = np.clip(showing_if_fault, LEAST_SHOWING, 1.0)
         self.current[..., FAULTS] = log_fault + np.log(self.showing[..., control])
         with np.errstate(divide="ignore"):  # a fault that certainly shows is not hidden
             self.hidden = log_fault + np.log1p(-self.showing[..., control])

@@ -246,12 +246,14 @@ class Watch:
 
     @contextmanager
     def begin(self, feed: Feed, patch: GivenPatch | None = None) -> Iterator[None]:
-        """Open the journal, and restore twin and intake after its last line.
+        """Open the journal, and restore the twin and the intake to their state at its last line.
 
         At the end of this context the counts of the messages are written.
 
         Parameters
         ----------
+        feed : Feed
+            The messages to watch; `Intake.restore` says from which one on they are read.
         patch : GivenPatch, optional
             A patch to adopt before the first step.
         """

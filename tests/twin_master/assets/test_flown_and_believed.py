@@ -27,7 +27,12 @@ from fmu_asset.ssp.reader import read_ssp
 from scenarios import binding_files
 from tests.refusals import Inputs, refused
 from tests.twin_master.runs import figures_of, loaded_from, patch_record, prepared, table_of, text_of, written
-from twin_master.assets.asset_source import AssetSource, PairedSource
+from twin_master.assets.asset_source import (
+    FLOWN_DESIGN_HASH,
+    AssetSource,
+    PairedSource,
+    calibration_sentence,
+)
 from twin_master.assets.resolution import Overrides, asset_source, resolve_scenario
 from twin_master.assets.strain_library_source import StrainLibrary, load_strain_library
 from twin_master.assets.system_export import export_scenario
@@ -68,6 +73,31 @@ class DoubledPredictions(PairedSource):
 
     def observation_table(self, draws: Any, model: Any) -> Any:
         return 2.0 * super().observation_table(draws, model)
+
+
+CALIBRATED, OTHER = 64 * "a", 64 * "b"
+SAME = "The twin believes the design that was calibrated, aaaaaaaaaaaa."
+ANOTHER = "The twin believes the design bbbbbbbbbbbb, which is not the one that was calibrated, aaaaaaaaaaaa."
+NOT_KNOWN = "It is not known whether the twin believes the design that was calibrated."
+
+
+@pytest.mark.parametrize(
+    ("calibrated", "believed", "hashes", "comparison"),
+    [
+        (CALIBRATED, "design", {"design": CALIBRATED, FLOWN_DESIGN_HASH: OTHER}, SAME),
+        (CALIBRATED, "design", {"design": OTHER, FLOWN_DESIGN_HASH: CALIBRATED}, ANOTHER),
+        (CALIBRATED, "FMU", {FLOWN_DESIGN_HASH: CALIBRATED}, SAME),
+        (CALIBRATED, "FMU", {FLOWN_DESIGN_HASH: OTHER}, ANOTHER),
+        (CALIBRATED, "library", {FLOWN_DESIGN_HASH: OTHER}, NOT_KNOWN),
+        (CALIBRATED, "FMU", {}, NOT_KNOWN),
+        ("", "design", {"design": OTHER}, NOT_KNOWN),
+    ],
+)
+def test_a_mission_says_whether_the_believed_design_was_calibrated(calibrated, believed, hashes, comparison):
+    record = {"campaign": "ground test", "model": "bracket", "design_hash": calibrated}
+    sentence = calibration_sentence(record, "FMU", believed, hashes)
+    assert sentence is not None
+    assert sentence.endswith(f". {comparison}")
 
 
 def test_a_subclass_of_a_pair_changes_what_the_twin_predicts():
