@@ -141,8 +141,8 @@ class EstimatorStart:
     trajectories : tuple of Trajectory
         The trajectory of each trial.
     processes : mapping of int to Process
-        The missing forces. They are large enough for the trajectory to follow the readings with any
-        laws.
+        The missing forces: large enough for the trajectories to follow the readings with any laws,
+        or small if the estimate is along the motion of the laws alone.
     """
 
     effect: FloatArray

@@ -138,9 +138,9 @@ def prior_tests(problem: Problem, fit: CandidateFit) -> list[NamedTest]:
     - A test that fails (p = 0) if a calibrated parameter is at the end of its range.
     - One χ² test of all gains that have a prior, together.
     - A χ² test of each effect parameter. Magnitudes, free shapes and parameters with a uniform
-      prior are left out, as they may have any value.
-    - A χ² test of each gain error that is an effect, although it is a magnitude: if a sensor seems
-      to read twice as much, the structure more often differs at its place.
+      prior are left out, as they may have any value. Gain errors are tested although they are
+      magnitudes: if a sensor seems to read twice as much, it is more often the structure that
+      differs at its place.
 
     The χ² tests are conservative, since estimates scatter less than the prior.
     """
