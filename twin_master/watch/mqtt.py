@@ -74,7 +74,8 @@ class Topic(Feed):
     def messages(self, position: Position | None) -> Iterator[FeedItem]:
         """Yield the messages that the session has passed on, without end.
 
-        None is yielded while there is none. The position is not used: a broker cannot go back.
+        While there is none, (None, "") is yielded. The position is not used: a broker cannot go
+        back.
         """
         while True:
             yield from self._items_of(self.payloads.popleft() if self.payloads else None)
@@ -263,9 +264,9 @@ class MqttFeed(Topic):
         return len(self._session.unread)
 
     def messages(self, position: Position | None) -> Iterator[FeedItem]:
-        """Yield the messages as they come, without end; None while nothing comes.
+        """Yield the messages as they come, without end; (None, "") while nothing comes.
 
-        A message is acknowledged once its step is in the journal.
+        A message is acknowledged once its step is in the journal. The position is not used.
         """
         for message in self._session.receive(0.1):
             yield from self._items_of(None if message is None else bytes(message.payload))
