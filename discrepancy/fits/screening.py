@@ -156,21 +156,14 @@ class Screen:
         return ScreenedChange(term, effect_values, vector, overlap, max(squared_length, 0.0))
 
     def refit_with_effect(self, term: EffectTerm, effect_values: FloatArray) -> tuple[float, Point]:
-        """Refit what is eliminated, to first order, if one more effect acts.
-
-        Parameters
-        ----------
-        term : EffectTerm
-            The effect at its place, added to those of the fit.
-        effect_values : (E,) array
-            The scaled parameters of the effect.
+        """Refit the eliminated unknowns to first order beside an effect, see `change_by_effect`.
 
         Returns
         -------
         objective : float
             The negative log posterior [nat], up to the same constant as that of a fit.
         point : Point
-            The refitted unknowns.
+            The refitted unknowns, with the parameters of the effect at the end.
         """
         problem, point = self.problem, self.fit.point
         change = self.change_by_effect(term, effect_values).vector
