@@ -32,6 +32,8 @@ MOTION_OF_FORCE_UNIT = {
     "N or N m": ("force", "m or rad", "m/s or rad/s"),
 }
 """What is missing at a port, and the units of its displacement and speed, by the unit of force."""
+ROUNDING_OF_MOTION = 1e-9
+"""Displacement or speed over its rms below which it is a rounding error, as at a release."""
 
 
 def headline(verdict: Verdict) -> str:
@@ -106,9 +108,10 @@ def force_sentence(force: ForceAtPort) -> str:
         f"A {name} of {number(force.rms)} {force.unit} (rms) is missing at {force.port}, "
         f"at most {number(abs(force.largest.force))}"
     )
-    motion = f"{number(force.largest.speed)} {speed_unit}"
+    motion = f"{_motion_text(force.largest.speed, force.speed)} {speed_unit}"
     if displacement_unit:
-        motion = f"{number(force.largest.displacement)} {displacement_unit} and {motion}"
+        displacement = _motion_text(force.largest.displacement, force.displacement)
+        motion = f"{displacement} {displacement_unit} and {motion}"
     comparison = f"evidence {nats(evidence)} nat over none"
     if other_ports:
         nearest = max(other_ports, key=lambda port: other_ports[port])
@@ -119,6 +122,11 @@ def force_sentence(force: ForceAtPort) -> str:
     dependence = "" if force.law else f"; {force.dependence}"
     sentence = f"{size} at {motion}{dependence} ({comparison})."
     return f"{sentence} {_sentence_on_law(force)}".rstrip()
+
+
+def _motion_text(value: float, rms: float) -> str:
+    """Return a displacement or speed as text; a rounding error beside the rms is told as zero."""
+    return number(value if abs(value) > ROUNDING_OF_MOTION * rms else 0.0)
 
 
 def _sentence_on_law(force: ForceAtPort) -> str:

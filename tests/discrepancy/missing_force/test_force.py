@@ -287,6 +287,12 @@ def test_a_report_opens_with_the_missing_force(friction_on_rail):
     assert "Beside Coulomb friction" in sentence
 
 
+def test_a_speed_that_is_a_rounding_error_is_told_as_zero(friction_on_rail):
+    told = friction_on_rail.verdict.force
+    at_release = replace(told, largest=replace(told.largest, speed=-1e-16))
+    assert " m and 0 m/s" in force_sentence(at_release)
+
+
 def test_the_missing_force_is_drawn_with_two_deviations_about_it(friction_on_rail):
     axes = missing_force_figure(friction_on_rail.missing).axes
     course = course_of_largest_force(friction_on_rail)
