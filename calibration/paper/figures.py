@@ -199,7 +199,10 @@ _RUN_LINES = ("-", "--", "-.", ":")
 
 @style.publication_style()
 def calibration_figure(result: StaticCalibration) -> Figure:
-    """Draw Fig. 5 of the paper: the load test with bands; densities of e and stiffness."""
+    """Draw Fig. 5 of the paper: the load test, and the densities of e and of the tip stiffness.
+
+    e is the factor on Young's modulus.
+    """
     figure = style.new_figure(height=4.4)
     axes = figure.subplot_mosaic(
         [
@@ -217,7 +220,7 @@ def calibration_figure(result: StaticCalibration) -> Figure:
 
 
 def _draw_factor(axes: Axes, result: StaticCalibration) -> None:
-    """Draw the densities of e."""
+    """Draw the densities of e: its prior, the likelihood of each measured pair, its posteriors."""
     particle = result.particle
     run_numbers = np.searchsorted(result.data.run_indices, result.data.run).tolist()
     for pair, run in enumerate(run_numbers):
@@ -260,7 +263,10 @@ def _draw_legend_of_densities(axes: Axes) -> None:
 
 
 def _draw_loads(axes: Axes, result: StaticCalibration) -> None:
-    """Draw the measured pairs, and the bands of load over displacement."""
+    """Draw measured pairs of load and tip displacement, and the bands before and after them.
+
+    A band is the 95 % interval of the load by the tip stiffness, a priori and a posteriori.
+    """
     data = result.data
     largest_displacement = 1.12 * float(data.displacement.max())
     displacement = np.array([0.0, largest_displacement])

@@ -141,7 +141,7 @@ def merge_clocks(
 
 
 def _remark_on_loads(filled_loads: Sequence[str], outside: int) -> str:
-    """Return the end of the remark: which loads were interpolated, and how many times are left out.
+    """Say at the end of a remark which loads were interpolated and how many times are left out.
 
     Parameters
     ----------
@@ -188,18 +188,18 @@ def _hold_of_load(column: LaboratoryColumn, holds: Mapping[str, str | None]) -> 
 def _place_cells(
     cells: Sequence[str], rows: Sequence[int], positions: Sequence[int], count: int
 ) -> list[str]:
-    """Return `count` cells: cells of a table at some positions, and empty cells elsewhere.
+    """Copy cells of a column to given positions of a longer column, which is empty elsewhere.
 
     Parameters
     ----------
     cells : sequence of str
-        The cells of a column of the table.
+        The cells of the column.
     rows : sequence of int
-        Rows of the table whose cells are taken.
+        The rows whose cells are copied.
     positions : sequence of int
-        The position of each of them in the result.
+        The new position of each of these rows.
     count : int
-        The number of cells of the result.
+        The number of cells of the longer column.
     """
     result = [""] * count
     for position, row in zip(positions, rows, strict=True):
@@ -213,9 +213,9 @@ def _line_numbers(
     positions: Sequence[Sequence[int]],
     count: int,
 ) -> list[int]:
-    """Return the line in the file of each of `count` merged times.
+    """Return the line in the file of each merged time.
 
-    If several clocks have the same time, the line of the first of these clocks is taken.
+    A time that several clocks have in common has the line of the first of these clocks.
 
     Parameters
     ----------
@@ -240,10 +240,11 @@ def _line_numbers(
 def _rest_samples_in_order(
     clocks: Sequence[TableClock], times: Sequence[_ClockTimes], decimal: str
 ) -> MergedTable:
-    """Return the table of a noise record whose columns were sampled by several clocks.
+    """Merge a noise record whose columns were sampled by several clocks, sample by sample.
 
-    Row k holds the k-th sample of each clock, although the clocks took it at different times: only
-    the sampling interval of a noise record matters. Shorter columns end with empty cells.
+    Row k of the merged table holds the k-th sample of each clock, although the clocks took it at
+    different times: for a noise record only the sampling interval matters. Shorter columns end with
+    empty cells.
 
     Raises
     ------
@@ -281,7 +282,7 @@ def _rest_samples_in_order(
 
 
 def _clock_times(clock: TableClock, decimal: str) -> _ClockTimes:
-    """Return the times of a clock, evenly spaced if they are so up to the rounding in print.
+    """Return the times of a clock, made evenly spaced if only rounding in print hides that.
 
     Raises
     ------
@@ -361,7 +362,7 @@ def _merged_times(times: Sequence[_ClockTimes]) -> tuple[FloatArray, list[list[i
 def _fill_between_samples(
     cells: list[str], seconds: FloatArray, positions: Sequence[int], hold: Hold
 ) -> None:
-    """Interpolate a load at the times of other clocks; `cells` is changed in place.
+    """Fill the cells of a load at the times of other clocks by interpolation, in place.
 
     A load with an empty cell at one of its own samples, or with a single sample, is not changed.
 

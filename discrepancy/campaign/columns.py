@@ -121,11 +121,11 @@ class LaboratoryColumn:
 def role_by_unit(
     head: str, heads: Sequence[str], units: Sequence[str], roles: Collection[str]
 ) -> str:
-    """Return the role of a column, "time" or "force", if its unit alone determines it.
+    """Return the role of a column, "time" or "force", if its unit alone determines it, or "".
 
-    A column is a time if `time_heads` finds it among the times of the table, of which there may be
-    several. Otherwise its unit determines a role only if no other column of the table has a unit of
-    the same role, and if the role is among `roles`. Else the result is an empty text.
+    A column is a time if `time_heads` counts it among the times of the table, of which there may be
+    several. Otherwise its unit determines its role if this role is among `roles`, and if no other
+    column of the table has a unit of the same role.
 
     Parameters
     ----------
@@ -141,7 +141,8 @@ def role_by_unit(
         return "time"
     roles_of_units = [load_or_time_role(unit) for unit in units]
     role_of_unit = roles_of_units[heads.index(head)]
-    return role_of_unit if role_of_unit in roles and roles_of_units.count(role_of_unit) == 1 else ""
+    is_only_column = roles_of_units.count(role_of_unit) == 1
+    return role_of_unit if role_of_unit in roles and is_only_column else ""
 
 
 def scaled_unit(head: str, unit: str, scale: str) -> tuple[str, str, float]:
@@ -269,7 +270,7 @@ def gain_deviation(head: str, answer: str) -> float | str:
 
 
 def degrees_celsius(answer: str) -> float:
-    """Return the temperature [degC] of the option `--reference-temperature`, such as 20 or 293.15K.
+    """Read the option `--reference-temperature`, such as 20 or 293.15K; return it in [degC].
 
     Raises
     ------
@@ -363,10 +364,10 @@ def release_in_si(answer: str) -> dict[str, str | float]:
 def units_of_columns(
     columns: Iterable[LaboratoryColumn], kinds: Mapping[str, str]
 ) -> dict[str, str]:
-    """Return the unit in which each channel, input and force was read, by its name.
+    """Return the unit in which the readings of each channel, input and force are printed.
 
-    If tables have several units for one name, it is that of the first table. A temperature has its
-    SI unit.
+    If tables have several units for one name, the first table decides. A temperature has its SI
+    unit.
 
     Parameters
     ----------
@@ -374,6 +375,11 @@ def units_of_columns(
         The columns of all tables.
     kinds : mapping of str to str
         The kind of each table's trial, by the name of the table.
+
+    Returns
+    -------
+    dict of str to str
+        Unit by the name of the channel or input, or by "force".
     """
     units: dict[str, str] = {}
     for column in columns:

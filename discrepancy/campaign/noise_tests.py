@@ -30,10 +30,10 @@ LEAST_DRAWS = 8_000
 def variance_p_value(
     mean_square: float, freedom: float, noise_freedom: float, *, small: bool = False
 ) -> float:
-    """Return the p-value of a mean square of residuals, if they contain noise alone.
+    """Return the p-value of a mean square of residuals under the hypothesis of noise alone.
 
-    The mean square over the estimated variance of the noise has an F distribution. If the variance
-    is known exactly, the sum of squares has a chi-squared distribution.
+    The mean square, divided by the estimated variance of the noise, then has an F distribution. If
+    the variance of the noise is known exactly, the sum of squares has a chi-squared distribution.
 
     Parameters
     ----------
@@ -56,15 +56,16 @@ def variance_p_value(
 def pooled_variance_p_value(
     p_values: FloatArray, freedom: FloatArray, noise_freedom: FloatArray
 ) -> float:
-    """Combine the p-values of several channels' mean squares into one.
+    """Combine the p-values of several channels' mean squares into one by Stouffer's method.
 
-    Each p-value becomes a standard normal score. The weighted sum of the scores, divided by the
-    root of the sum of the squared weights, is again standard normal if the channels are independent
-    (Stouffer's method), so that the combined p-value is exact then. A sum of the squares themselves
-    would have a heavy tail if a noise record is short. The weight of a channel is the inverse
-    standard deviation of its mean square, which has the variance 2 / freedom + 2 / noise_freedom: a
-    model error that raises all mean squares by the same amount is then found best. A common factor
-    of the weights cancels.
+    Each p-value becomes a standard normal score. The combined score is the weighted sum of the
+    scores over the root of the sum of the squared weights; if the channels are independent, it is
+    standard normal as well, and the combined p-value is exact. (The sum of the mean squares
+    themselves would have a heavy tail where a noise record is short.)
+
+    The weight of a channel is the inverse standard deviation of its mean square, whose variance is
+    2 / freedom + 2 / noise_freedom. These weights find a model error best that raises all mean
+    squares by the same amount. A common factor of the weights cancels.
 
     Parameters
     ----------
@@ -96,14 +97,15 @@ class SeriesTest(NamedTuple):
 
 
 def ljung_box(series: FloatArray, is_used: BoolArray | None = None) -> SeriesTest:
-    """Test whether a series of residuals is white by the statistic of Ljung and Box.
+    """Test whether a series of residuals is white by the statistic Q of Ljung and Box.
 
-    With the autocorrelations rho_k, Q = n (n + 2) sum_k rho_k^2 / (n - k) over min(20, n / 5) lags
-    (Ljung and Box 1978, Biometrika 65, eq. (1.3)); the mean is known to be zero. Chi-squared is too
-    light in its tail for Q: at n = 64 its 99 % point is exceeded up to four times too often. The
-    p-value is therefore that of a gamma distribution with the mean, variance and skewness of Q at
-    this n. If a model was fitted to the series, a false rejection becomes less probable, never
-    more. A series too short for one lag, or of zeros, has the p-value 1.
+    Q = n (n + 2) sum_k rho_k^2 / (n - k) over the lags k = 1 .. min(20, n / 5), where rho_k are the
+    autocorrelations of a series of n samples whose mean is known to be zero (Ljung and Box 1978,
+    Biometrika 65, eq. (1.3)). The chi-squared distribution is too light in its tail for Q: at
+    n = 64, Q exceeds its 99 % point up to four times too often. The p-value is therefore taken from
+    a gamma distribution with the mean, variance and skewness of Q at this n. If a model was fitted
+    to the series, a false rejection becomes less probable, never more. A series that is zero, or
+    too short for one lag, has the p-value 1.
 
     Parameters
     ----------
@@ -170,7 +172,7 @@ def autocorrelation(series: Sequence[FloatArray]) -> tuple[FloatArray, FloatArra
     -------
     rho : (K,) ndarray
         Autocorrelation at lags 1 .. K, with K a quarter of the longest record.
-    chance : (K,) ndarray
+    white_variance : (K,) ndarray
         The variance of `rho` if the records are white.
     """
     longest = max(len(record) for record in series)
@@ -184,7 +186,8 @@ def autocorrelation(series: Sequence[FloatArray]) -> tuple[FloatArray, FloatArra
         pair_counts[:lag_count] += len(record) - np.arange(lag_count)
     rho = products[1:] / max(products[0], LEAST_DIVISOR)
     # for white noise: (number of pairs) sigma^4 over (sum of squares = n sigma^2)^2
-    return rho, pair_counts[1:] / pair_counts[0] ** 2
+    white_variance = pair_counts[1:] / pair_counts[0] ** 2
+    return rho, white_variance
 
 
 def statistical_inefficiency(
@@ -217,7 +220,7 @@ def statistical_inefficiency(
 
 
 def _portmanteau(rows: FloatArray, count: int, pairs: FloatArray) -> FloatArray:
-    """Return the Ljung-Box statistic Q (M,) of each of several series.
+    """Return the Ljung-Box statistic Q of each of M series, an (M,) array.
 
     Parameters
     ----------
@@ -237,7 +240,7 @@ def _portmanteau(rows: FloatArray, count: int, pairs: FloatArray) -> FloatArray:
 def _portmanteau_moments(count: int, lags: int) -> tuple[float, float, float]:
     """Return mean, standard deviation and skewness of the Ljung-Box Q for white noise.
 
-    All three are found by a simulation with a fixed seed.
+    The mean is known; the other two are found by a simulation with a fixed seed.
 
     Parameters
     ----------

@@ -162,7 +162,7 @@ class IdentifiedFmu(FmuRuns):
         ports: Sequence[str],
         force_factors: Mapping[str, float] | None = None,
     ) -> FmuExcitation:
-        """Return the excitation of a trial, still without its force or release.
+        """Return the inputs and the step of a trial's run; the force or release is added later.
 
         Parameters
         ----------
@@ -173,7 +173,7 @@ class IdentifiedFmu(FmuRuns):
         ports : sequence of str
             Ports at which laws act.
         force_factors : mapping of str to float, optional
-            Factor of the recorded force by input.
+            For each input that the recorded force drives, the factor on this force.
         """
         force_factors = force_factors or {}
         law_inputs = [self.port_inputs[self.ports.index(name)] for name in ports]
@@ -186,11 +186,11 @@ class IdentifiedFmu(FmuRuns):
     def linear_system(self, excitation: FmuExcitation) -> FmuStateSpace | None:
         """Return the FMU as a linear system; None if it is not linear.
 
-        The system is identified from the responses to single forces and releases. The FMU is linear
-        if such a system exists, and predicts the response to all forces and releases together. This
-        prediction is tested once for a set of inputs and releases, at the first operating point.
-        The result is also None if the file forbids superposition, or if there is nothing to excite
-        the FMU.
+        The system is identified from the responses to one force or release at a time. The FMU
+        counts as linear if such a system exists and also predicts the response to all forces and
+        releases together. This prediction is tested once for each set of inputs and releases, at
+        the first operating point. The result is also None if the file of the model forbids
+        superposition, or if there is no input or release to excite the FMU.
         """
         has_excitation = bool(excitation.inputs or excitation.releases)
         if not self.description.superposition or not has_excitation:
@@ -221,10 +221,10 @@ class IdentifiedFmu(FmuRuns):
         return realise_state_space(records, len(excitation.inputs), excitation.step)
 
     def _response_to_force(self, excitation: FmuExcitation, name: str) -> FloatArray:
-        """Return the outputs (recorded_steps + 1, C) after a unit force over the first step.
+        """Return the response (recorded_steps + 1, C) of the outputs to a unit force in one step.
 
-        The FMU gets a force of the probing amplitude of its input, and the difference of its
-        outputs to those without a force is divided by the amplitude.
+        A force of the input's probing amplitude acts during the first step. The outputs without it
+        are subtracted, and the difference is divided by the amplitude.
         """
         amplitude = self.probing_amplitude(name)
         force_by_step = np.zeros(excitation.recorded_steps)
@@ -240,11 +240,11 @@ class IdentifiedFmu(FmuRuns):
         return self.cached(key, lambda: self._motion_of_run(excitation, run) / amplitude)
 
     def _response_to_release(self, excitation: FmuExcitation, name: str) -> FloatArray:
-        """Return the outputs (recorded_steps + 1, C) after a release by one unit.
+        """Return the response (recorded_steps + 1, C) of the outputs to a release from one unit.
 
-        The outputs without a release are subtracted. The FMU is released by an amplitude by which
-        the outputs are divided: that of the excitation, or for an input its probing amplitude. All
-        later calls for this variable use the amplitude of the first call.
+        The FMU is released from some amplitude: that of the excitation, or for an input its probing
+        amplitude. The outputs without a release are subtracted, and the difference is divided by
+        the amplitude. Later calls for the same variable use the amplitude of the first call.
         """
         nominal_amplitude = excitation.releases[name] or 1.0
         if self._is_input(name):
@@ -274,8 +274,9 @@ class IdentifiedFmu(FmuRuns):
     ) -> bool:
         """Return whether a linear system predicts the FMU's response to all inputs at once.
 
-        The releases act, the recorded force, and random forces (of a fixed seed) on all other
-        inputs. The largest error of each output may be `tolerance` times its largest motion.
+        In this test the releases and the recorded force act, and random forces (of a fixed seed) on
+        all other inputs. The prediction is good enough if the largest error of each output is at
+        most `tolerance` times its largest value.
         """
         release_values = self._release_values_of_system(excitation)
         run = self._run_of_excitation(excitation, release_values)
@@ -294,9 +295,9 @@ class IdentifiedFmu(FmuRuns):
             loads.append(Load(direction, history))
         start = self._start_state(system, excitation, release_values)
         states, acting = system_motion(system, Excitation(time, time, loads), start)
-        by_states = states @ system.output_matrix.T
-        by_inputs = acting @ system.feedthrough.T
-        prediction_error = motion - by_states - by_inputs
+        outputs_of_states = states @ system.output_matrix.T
+        outputs_of_inputs = acting @ system.feedthrough.T
+        prediction_error = motion - outputs_of_states - outputs_of_inputs
         # the first row, before any step, does not count
         largest_error = np.max(np.abs(prediction_error)[1:], axis=0)  # (C,)
         largest_motion = np.max(np.abs(motion), axis=0)
@@ -306,10 +307,11 @@ class IdentifiedFmu(FmuRuns):
     # ------------------------------------------------------------ releases
 
     def _release_values_of_system(self, excitation: FmuExcitation) -> dict[str, float]:
-        """Return the release parameters or holding force that give a linear FMU its displacement.
+        """Return the values of the release variables that give a linear FMU its displacement.
 
-        The first one is the displacement over that of the release point under a unit value. Without
-        an output of the release point, the values of the excitation are returned.
+        Only the first value is computed: the stated displacement of the release point over its
+        displacement by a unit value. If no output shows the release point, the values of the
+        excitation are returned.
         """
         release_values = dict(excitation.releases)
         column = self.variables.columns.get("release")
@@ -322,10 +324,10 @@ class IdentifiedFmu(FmuRuns):
         return release_values
 
     def _find_release_values(self, excitation: FmuExcitation) -> dict[str, float]:
-        """Return the release parameters or holding force that give any FMU its displacement.
+        """Return the values of the release variables that give any FMU its displacement.
 
-        The first one is found by the secant method, with the FMU at the start of a run. Without an
-        output of the release point, the values of the excitation are returned.
+        Only the first value is computed, by the secant method, with the FMU at the start of a run.
+        If no output shows the release point, the values of the excitation are returned.
 
         Raises
         ------
@@ -342,7 +344,7 @@ class IdentifiedFmu(FmuRuns):
             return release_values
 
         def missing_displacement(amount: float) -> float:
-            """Return the displacement by an amount minus the displacement of the release [m]."""
+            """Return the displacement that an amount causes, minus the stated one [m]."""
             at_begin = excitation._replace(force=None, recorded_steps=0)
             run = self._run_of_excitation(at_begin, {name: amount})
             key = (excitation.state, excitation.step, name, amount, "begin")
@@ -364,11 +366,11 @@ class IdentifiedFmu(FmuRuns):
     def _run_of_excitation(
         self, excitation: FmuExcitation, release_values: Mapping[str, float]
     ) -> FmuRun:
-        """Return the run of the FMU under an excitation.
+        """Return the settings of the FMU's run under an excitation.
 
-        Release variables that are inputs of the FMU are set before the start; the others are
-        parameters of the operating point. Under a recorded force, the run begins from rest under
-        the force at the first sample.
+        A release variable that is an input of the FMU is set before the start; any other is a
+        parameter of the operating point. If a recorded force acts, the FMU starts at rest under the
+        force of the first sample.
         """
         initial_loads = {
             name: amount for name, amount in release_values.items() if self._is_input(name)
@@ -413,13 +415,13 @@ class IdentifiedFmu(FmuRuns):
     # ------------------------------------------------------------ communication step
 
     def choose_step(self, trial: Trial, state: OperatingPoint) -> StepChoice:
-        """Return the angular frequency of the FMU's first mode, and the step for a trial.
+        """Return the angular frequency of the FMU's first mode, and the time step for a trial.
 
         The file of the model may state both. Otherwise the first mode is the one with the largest
         flexibility at the first port; without ports, or if the FMU is not linear, it is the one
         with the highest peak in the spectrum. The step is an integer fraction of the sampling
-        interval, at which no mode is aliased and the first mode turns by at most
-        `LARGEST_STEP_PHASE`.
+        interval, small enough that no mode is aliased and that the phase of the first mode grows by
+        at most `LARGEST_STEP_PHASE` in a step.
         """
         interval = trial.interval
         system, excitation, steps_per_sample = self._system_that_shows_all_modes(
@@ -459,28 +461,29 @@ class IdentifiedFmu(FmuRuns):
     def _system_that_shows_all_modes(
         self, excitation: FmuExcitation, interval: float
     ) -> SampledSystem:
-        """Return the system identified at a step that samples all modes without aliasing.
+        """Return the system identified at a time step that samples all modes without aliasing.
 
-        The step is halved until no mode turns by more than `LARGEST_MODE_PHASE` in it, and the
-        system also predicts the FMU at half the step. The halving ends early if the FMU is not
-        linear, has a fixed step, or if the sampling interval has more than `MOST_PARTS` parts.
+        The first step is the sampling interval. It is halved until the phase of no mode grows by
+        more than `LARGEST_MODE_PHASE` in a step and the system also predicts the FMU at half the
+        step. The halving ends early if the FMU is not linear, has a fixed step, or if the sampling
+        interval is divided into more than `MOST_PARTS` steps.
         """
         fixed_step = self.description.motion.step
-        parts = 1
+        steps_per_interval = 1
         while True:
-            excitation = excitation._replace(step=fixed_step or interval / parts)
+            excitation = excitation._replace(step=fixed_step or interval / steps_per_interval)
             system = self.linear_system(excitation)
-            if system is None or fixed_step or parts > MOST_PARTS:
+            if system is None or fixed_step or steps_per_interval > MOST_PARTS:
                 break
             rates, _ = system.modes
-            largest_turn = np.max(np.abs(rates.imag)) * excitation.step
+            largest_phase = np.max(np.abs(rates.imag)) * excitation.step
             half_step = excitation._replace(step=0.5 * excitation.step)
-            if largest_turn <= LARGEST_MODE_PHASE and self._predicts_motion(
+            if largest_phase <= LARGEST_MODE_PHASE and self._predicts_motion(
                 system, half_step, ALIASING_TOLERANCE
             ):
                 break
-            parts *= 2
-        return SampledSystem(system, excitation, parts)
+            steps_per_interval *= 2
+        return SampledSystem(system, excitation, steps_per_interval)
 
     def _dominant_angular_frequency(self, excitation: FmuExcitation) -> float:
         """Return the angular frequency of the highest peak in the spectrum of a record [rad/s].

@@ -109,22 +109,20 @@ def draw_heat_map(
     slant: float,
     texts: NDArray[np.str_] | None = None,
 ) -> AxesImage:
-    """Draw values as a map of cells.
+    """Draw an array as a heat map, with names at its rows and columns, and texts in its cells.
 
     Parameters
     ----------
-    axes : Axes
-        The axes to draw on.
     values : (R, C) ndarray
-        Values; nan for an empty cell.
+        Values of the cells; NaN for an empty cell.
     names : (iterable of str, iterable of str)
         Names of the rows and of the columns.
     norm : Normalize
-        Colour scale.
+        The colour scale.
     slant : float
         Rotation of the columns' names [deg].
     texts : (R, C) ndarray of str, optional
-        Texts of the cells.
+        Texts of the cells; an empty one is not drawn.
     """
     image = axes.imshow(np.ma.masked_invalid(values), cmap=style.LEVELS, norm=norm, aspect="auto")
     row_names, column_names = map(list, names)
@@ -186,34 +184,34 @@ def rms_over_noise(trials: Sequence[FittedTrial], channel: str) -> float:
 
 
 def rms_table(residuals: ResidualSet) -> tuple[list[str], list[str], FloatArray]:
-    """Return the sizes of residuals by channel and trial.
+    """Return the rms residual of each channel in each trial, in standard deviations of the noise.
 
     Returns
     -------
     channels, trials : list of str
         Names of C channels and T trials; held-out trials are marked.
-    sizes : (C, T) ndarray
-        rms residuals over the noise; nan if a trial lacks a channel.
+    rms : (C, T) ndarray
+        rms residuals over the noise; NaN if a trial lacks a channel.
     """
     measured = {*residuals.channel_names}
     channels = [name for name in residuals.channels if name in measured]
     trial_names = []
-    sizes = np.full((len(channels), len(residuals.trials)), np.nan)
+    rms = np.full((len(channels), len(residuals.trials)), np.nan)
     for column, fitted in enumerate(residuals.trials):
         trial = fitted.trial
         is_marked = "held out" in trial.name
         mark = " (held out)" if trial.held_out and not is_marked else ""
         trial_names.append(f"{trial.name}{mark}")
         for row, channel in enumerate(channels):
-            sizes[row, column] = rms_over_noise([fitted], channel)
-    return channels, trial_names, sizes
+            rms[row, column] = rms_over_noise([fitted], channel)
+    return channels, trial_names, rms
 
 
 def gauge_places(channels: Sequence[Channel], design: WingDesign) -> dict[str, tuple[float, float]]:
     """Return where channels are drawn on the wing: distance from the root [m] and chord fraction.
 
-    The place that a channel states is taken, else the place of its strain gauge in the design, or
-    the tip if the channel measures the tip displacement. Other channels are left out.
+    A channel is drawn where it says it is. If it says nothing, it is drawn at its strain gauge in
+    the design, or at the tip if it measures the tip displacement. Other channels are left out.
     """
     places: dict[str, tuple[float, float]] = {}
     positions = design.gauges.positions
@@ -233,24 +231,25 @@ def gauge_places(channels: Sequence[Channel], design: WingDesign) -> dict[str, t
 def planform_figure(
     before: ResidualSet, after: ResidualSet | None, design: WingDesign
 ) -> Figure | None:
-    """Draw the rms residuals of the channels at their places on the planform of the wing.
+    """Draw the rms residuals of the channels where they are on the planform of the wing.
 
-    The models without and with the effect share one colour scale. None if no channel has a place.
+    There is one panel for the unchanged model (`before`) and one for the model with the effect
+    (`after`), on one colour scale. The result is None if no channel has a position.
     """
     places = gauge_places(list(before.channels.values()), design)
     if not places:
         return None
     drawn_models = models_to_draw(before, after)
-    sizes_of_models = []
+    rms_of_models = []
     for drawn in drawn_models:
-        sizes_of_models.append([rms_over_noise(drawn.residuals.trials, name) for name in places])
-    norm = size_colour_scale(np.array(sizes_of_models))
+        rms_of_models.append([rms_over_noise(drawn.residuals.trials, name) for name in places])
+    norm = size_colour_scale(np.array(rms_of_models))
     row_count = len(drawn_models)
     figure, grid = new_panels(row_count, 1, 1.62 * row_count + 0.35, sharex=True)
     all_axes = [axes for (axes,) in grid]
-    for axes, sizes, drawn in zip(all_axes, sizes_of_models, drawn_models, strict=True):
+    for axes, rms_of_channels, drawn in zip(all_axes, rms_of_models, drawn_models, strict=True):
         _draw_planform(axes, design)
-        for (name, place), value in zip(places.items(), sizes, strict=True):
+        for (name, place), value in zip(places.items(), rms_of_channels, strict=True):
             if np.isfinite(value):
                 position = _planform_position(design, *place)
                 is_strain = before.channels[name].quantity is Quantity.STRAIN
@@ -264,15 +263,13 @@ def planform_figure(
 
 
 def _planform_position(design: WingDesign, station: float, fraction: float) -> tuple[float, float]:
-    """Return the coordinates of a place in the planform [m]: along the span, and along the chord.
+    """Return the coordinates of a position in the planform [m]: along the span, along the chord.
 
-    The chordwise coordinate is measured from the leading edge at the root. The wing is straight at
-    the chord fraction `straight_chord_line`.
+    The chordwise coordinate is measured from the leading edge at the root. At the chord fraction
+    `straight_chord_line` the wing is straight.
 
     Parameters
     ----------
-    design : WingDesign
-        The wing.
     station : float
         Distance from the root [m].
     fraction : float

@@ -87,7 +87,7 @@ def stiffness_blocks(
     elasticity: FloatArray,
     factor: FloatArray | float = 1.0,
 ) -> FloatArray:
-    """Return the element stiffness matrices of cells.
+    """Return the element stiffness matrices of n cells: sum over q of w_q det J_q B_q^T C B_q.
 
     Parameters
     ----------
@@ -108,7 +108,7 @@ def stiffness_blocks(
     rule = kind.stiffness_rule
     spatial_gradients, determinant = gradients(kind, nodes, rule.points)
     B = strain_matrix(spatial_gradients)
-    measure = rule.weights * determinant * factor
+    measure = rule.weights * determinant * factor  # (n, q), volume at each point times the factor
     cell_count, point_count = measure.shape
     row_count = point_count * STRAINS
     unknown_count = AXES * kind.node_count
@@ -123,7 +123,7 @@ def stiffness_blocks(
 
 
 def mass_blocks(kind: ElementKind, nodes: FloatArray, density: ArrayLike, rule: Rule) -> FloatArray:
-    """Return the element mass matrices of cells for one displacement component.
+    """Return the element mass matrices of n cells, for one displacement component.
 
     Parameters
     ----------
@@ -272,10 +272,11 @@ class CellMesh:
         local_positions: FloatArray,
         direction: FloatArray,
     ) -> sparse.csr_array:
-        """Return the matrix (rows, 3 nn) from displacements to sums of normal strains.
+        """Return the matrix (rows, 3 nn) that gives weighted sums of normal strains at points.
 
-        The strain at a point in the direction d is d . grad(u . d): the sum over the nodes a of a
-        cell of (grad N_a . d) (d . u_a), with the spatial gradients dN_a/dX dX/dx.
+        It is multiplied by the displacements of all nodes. The normal strain in the direction d is
+        d . grad(u . d): the sum over the nodes a of the point's cell of (grad N_a . d) (d . u_a),
+        with the spatial gradient grad N_a = dN_a/dX dX/dx.
 
         Parameters
         ----------
@@ -359,17 +360,17 @@ class CellMesh:
 
         `blocks` returns the element matrices of a slice of the cells; a node has 1 or 3 components.
         """
-        size = components * len(self.points)
-        total = sparse.csr_array((size, size))
+        unknown_count = components * len(self.points)
+        total = sparse.csr_array((unknown_count, unknown_count))
         width = components * self.kind.node_count
         cells_at_once = max(BATCH, _SUMMED_ENTRIES // width**2)
         for start in range(0, len(cells), cells_at_once):
             end = min(start + cells_at_once, len(cells))
             # element matrices
             element_matrices = []
-            for first in range(start, end, BATCH):
-                last = min(first + BATCH, end)
-                batch = slice(first, last)
+            for batch_start in range(start, end, BATCH):
+                batch_end = min(batch_start + BATCH, end)
+                batch = slice(batch_start, batch_end)
                 element_matrices.append(blocks(batch))
             values = np.concatenate(element_matrices).ravel()
             # row and column of each entry

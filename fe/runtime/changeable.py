@@ -232,9 +232,11 @@ class ChangeableModel(ReducedModel):
         }
 
     def changes_of(self, patch: Iterable[Primitive]) -> "StructuralChanges":
-        """Collect the structural changes of a patch.
+        """Collect the structural changes of a patch, by the numbers of the changes.
 
-        Compliances at one location add up; what losses leave of one patch multiplies.
+        Changes are numbered from 1: motions of supports, then places of masses, then patches that
+        may lose stiffness. Several compliances of one support motion are added. If several losses
+        act on one patch, the fractions of its stiffness that they leave are multiplied.
 
         Raises
         ------
@@ -243,7 +245,7 @@ class ChangeableModel(ReducedModel):
         """
         compliances: dict[int, float] = {}
         masses: list[AddedMass] = []
-        remaining: dict[int, float] = {}
+        remaining_fractions: dict[int, float] = {}
         for primitive in patch:
             if isinstance(primitive, SupportCompliance):
                 if primitive.compliance < 0.0:
@@ -254,10 +256,10 @@ class ChangeableModel(ReducedModel):
                 number = 1 + self.support_number(primitive.support, primitive.motion)
                 compliances[number] = compliances.get(number, 0.0) + primitive.compliance
             elif isinstance(primitive, PlaceMass):
-                first = 1 + len(self.supports)
+                first_number = 1 + len(self.supports)
                 place = self._place_number(self.mass_places, primitive.place, "a mass")
                 self._check_distances(primitive, float(self.mass_reaches[place]))
-                number = first + place
+                number = first_number + place
                 masses.append(AddedMass(number, primitive.mass, primitive.along, primitive.across))
             elif isinstance(primitive, RegionStiffnessLoss):
                 if not 0.0 <= primitive.loss < 1.0:
@@ -270,10 +272,14 @@ class ChangeableModel(ReducedModel):
                         f"The extent of the loss of {primitive.region!r} must be positive, but is "
                         f"{primitive.extent:g}."
                     )
-                first = 1 + len(self.supports) + len(self.mass_places)
-                number = first + self._place_number(self.loss_places, primitive.region, "a loss")
-                remaining[number] = remaining.get(number, 1.0) * (1.0 - primitive.loss)
-        losses = {number: 1.0 - fraction for number, fraction in remaining.items()}
+                first_number = 1 + len(self.supports) + len(self.mass_places)
+                number = first_number + self._place_number(
+                    self.loss_places, primitive.region, "a loss"
+                )
+                remaining_fractions[number] = remaining_fractions.get(number, 1.0) * (
+                    1.0 - primitive.loss
+                )
+        losses = {number: 1.0 - fraction for number, fraction in remaining_fractions.items()}
         return StructuralChanges(compliances, tuple(masses), losses)
 
     def rows_of_mass(self, added: AddedMass) -> FloatArray:
@@ -315,7 +321,9 @@ class ChangeableModel(ReducedModel):
     def changed_load(
         self, load: FloatArray, control: str, patch: Iterable[Primitive]
     ) -> FloatArray:
-        """Return the load (n,) of a control after a patch has moved and turned its force.
+        """Return the load (n,) of a control after a patch has moved or turned its force.
+
+        An offset is a Taylor series of second order in the distance; a tilt is a rotation.
 
         Parameters
         ----------
@@ -324,21 +332,21 @@ class ChangeableModel(ReducedModel):
         patch : iterable of Primitive
             Only `LoadOffset` and `LoadTilt` of this control act.
         """
-        names = list(
+        change_keys = list(
             zip(self.load_controls, self.load_change_kinds, self.load_change_axes, strict=True)
         )
         for primitive in patch:
             if isinstance(primitive, LoadOffset) and primitive.control == control:
-                number = names.index((control, "offset", primitive.axis))
+                number = change_keys.index((control, "offset", primitive.axis))
                 load = (
                     load
                     + primitive.distance * self.load_changes[number]
                     + 0.5 * primitive.distance**2 * self.load_curvatures[number]
                 )
             elif isinstance(primitive, LoadTilt) and primitive.control == control:
-                number = names.index((control, "tilt", primitive.axis))
-                across = self.load_changes[number]
-                load = np.cos(primitive.angle) * load + np.sin(primitive.angle) * across
+                number = change_keys.index((control, "tilt", primitive.axis))
+                perpendicular_load = self.load_changes[number]
+                load = np.cos(primitive.angle) * load + np.sin(primitive.angle) * perpendicular_load
         return load
 
     def _check_distances(self, mass: PlaceMass, reach: float) -> None:
@@ -366,7 +374,7 @@ class ChangeableModel(ReducedModel):
     def parts_of_patch(
         self, change: int, columns: IntArray, basis: FloatArray
     ) -> tuple[IntArray, FloatArray]:
-        """Return the contributions of a patch to the stiffness terms, in a subspace.
+        """Return what a patch of the structure contributes to the stiffness terms, in a subspace.
 
         Parameters
         ----------
@@ -375,7 +383,7 @@ class ChangeableModel(ReducedModel):
         columns : (m,) array of int
             The coordinates of the model that the subspace uses.
         basis : (m, k) array
-            These coordinates from those of the subspace.
+            The matrix from coordinates of the subspace to these coordinates.
 
         Returns
         -------
@@ -385,12 +393,14 @@ class ChangeableModel(ReducedModel):
             The contribution to each of these terms.
         """
         patch = change - 1 - len(self.supports) - len(self.mass_places)
-        numbers = np.flatnonzero(self.loss_patch == patch)
+        parts_in_patch = np.flatnonzero(self.loss_patch == patch)
         # entries of the lower triangle, which is stored row by row
         rows = np.maximum.outer(columns, columns)
         triangle = rows * (rows + 1) // 2 + np.minimum.outer(columns, columns)
-        parts = [basis.T @ self.loss_stiffness[number][triangle] @ basis for number in numbers]
-        return self.loss_term[numbers], np.array(parts)
+        parts = [
+            basis.T @ self.loss_stiffness[number][triangle] @ basis for number in parts_in_patch
+        ]
+        return self.loss_term[parts_in_patch], np.array(parts)
 
     def support_number(self, support: str, motion: str) -> int:
         """Return the index of a support's motion; raise `InvalidPatchError` if there is none."""
@@ -435,21 +445,21 @@ class ChangeableModel(ReducedModel):
         displacements : (n, k) array
             The static displacements under them, with unchanged supports.
         springs : (S,) array
-            The springs of the motions.
+            The spring of each support motion [N/m or N m/rad]; 0 where the motion is held rigidly.
 
         Returns
         -------
         (S, k) array
             The force or moment along each motion.
         """
-        resisting = springs[:, np.newaxis]
-        is_held = resisting == 0.0
-        return np.where(
-            is_held, self.support_rows @ loads, resisting * (self.support_rows @ displacements)
-        )
+        stiffness = springs[:, np.newaxis]
+        is_held = stiffness == 0.0
+        reaction_of_rigid_support = self.support_rows @ loads
+        reaction_of_spring = stiffness * (self.support_rows @ displacements)
+        return np.where(is_held, reaction_of_rigid_support, reaction_of_spring)
 
     def compliance_gains(self, vector: FloatArray) -> FloatArray:
-        """Return the relative gain of compliance per added compliance of each support motion.
+        """Return the relative increase of compliance per unit of compliance added at each support.
 
         Parameters
         ----------
@@ -459,25 +469,27 @@ class ChangeableModel(ReducedModel):
         Returns
         -------
         (S, L + M) array
-            The gain [N/m or N m/rad] of the compliance under each load, and of the inverse squared
-            frequency of each mode.
+            For each of S support motions the increase [N/m or N m/rad] of the compliance under each
+            load, then that of the inverse squared frequency of each mode, each over its value.
         """
         structure = ChangedStructure(self, vector, ModelPatch())
         loads = self.whole_load.T
         displacements = structure.basis @ structure.static(structure.basis.T @ loads)
         work = np.sum(loads * displacements, axis=0)
         springs = self.springs_at(vector)
-        by_load = self.reactions(loads, displacements, springs) ** 2 / np.where(
+        gains_of_loads = self.reactions(loads, displacements, springs) ** 2 / np.where(
             work > 0.0, work, np.inf
         )
         frequency = structure.modes.frequency
         shapes = structure.basis @ structure.mode_shapes
-        squares = (2.0 * np.pi * frequency) ** 2
+        squared_angular_frequency = (2.0 * np.pi * frequency) ** 2
         # a mode is the displacement at rest under its inertia forces
         mass = dense_sum(self.mass_coefficients(vector), self.whole_mass)
-        inertia = squares * (mass @ shapes)
-        by_mode = self.reactions(inertia, shapes, springs) ** 2 / squares
-        return np.concatenate((by_load, by_mode), axis=1)
+        inertia_forces = squared_angular_frequency * (mass @ shapes)
+        gains_of_modes = (
+            self.reactions(inertia_forces, shapes, springs) ** 2 / squared_angular_frequency
+        )
+        return np.concatenate((gains_of_loads, gains_of_modes), axis=1)
 
 
 class _Subspaces:
@@ -492,7 +504,11 @@ class _Subspaces:
         return self._of_changes(tuple(sorted(set(changes))))
 
     def _build(self, changes: tuple[int, ...]) -> Subspace:
-        """Build a subspace: orthonormal directions, then the motions of released supports."""
+        """Build the subspace of a set of changes.
+
+        Its coordinates are directions that are orthonormal in the energy norm, then the motions of
+        supports that the changes release.
+        """
         model = self._model
         released_columns = model.released_columns
         released = [
@@ -500,24 +516,26 @@ class _Subspaces:
             for change in changes
             if change <= len(released_columns) and released_columns[change - 1] >= 0
         ]
-        acts = np.isin(model.column_owner, (0, *changes))
-        acts[released_columns[released_columns >= 0]] = False
-        columns = np.flatnonzero(acts)
+        is_column_used = np.isin(model.column_owner, (0, *changes))
+        is_column_used[released_columns[released_columns >= 0]] = False
+        columns = np.flatnonzero(is_column_used)
         # orthonormal in the energy norm at the midpoint of all ranges
         reference = np.append(model.bound_reference, 1.0)
         own_block = (slice(None), columns[:, np.newaxis], columns)
         energy = dense_sum(reference, model.whole_stiffness[own_block])
         scale = 1.0 / np.sqrt(np.diag(energy))
-        squares, directions = np.linalg.eigh(scale[:, np.newaxis] * energy * scale)
-        is_used = squares > LEAST_DIRECTION * squares[-1]
-        used_directions = directions[:, is_used] / np.sqrt(squares[is_used])
-        count = int(is_used.sum())
+        eigenvalues, eigenvectors = np.linalg.eigh(scale[:, np.newaxis] * energy * scale)
+        is_used = eigenvalues > LEAST_DIRECTION * eigenvalues[-1]
+        orthonormal_directions = eigenvectors[:, is_used] / np.sqrt(eigenvalues[is_used])
+        direction_count = int(is_used.sum())
         # the terms hold hundreds of columns of other changes, which are left out of the products
         columns = np.concatenate((columns, np.array(released, dtype=np.int64)))
-        rows_of_basis = np.zeros((len(columns), count + len(released)))
-        rows_of_basis[: len(scale), :count] = scale[:, np.newaxis] * used_directions
-        rows_of_basis[len(scale) :, count:] = np.eye(len(released))
-        basis = np.zeros((len(acts), count + len(released)))
+        rows_of_basis = np.zeros((len(columns), direction_count + len(released)))
+        rows_of_basis[: len(scale), :direction_count] = (
+            scale[:, np.newaxis] * orthonormal_directions
+        )
+        rows_of_basis[len(scale) :, direction_count:] = np.eye(len(released))
+        basis = np.zeros((len(is_column_used), direction_count + len(released)))
         basis[columns] = rows_of_basis
         block = (slice(None), columns[:, np.newaxis], columns)
         return Subspace(

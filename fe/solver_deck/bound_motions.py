@@ -80,9 +80,9 @@ def read_tied_motions(
     """
     if not dofs:
         return {}
-    first = _free_number(jobs)
+    first_added = _free_number(jobs)
     nodes = list(dict.fromkeys(node for node, _ in dofs))
-    added_node = {node: first + number for number, node in enumerate(nodes)}
+    added_node = {node: first_added + number for number, node in enumerate(nodes)}
     probes = [_Probe((node, axis), added_node[node], axis) for node, axis in dofs]
     added_blocks = _added_nodes(jobs, {added_node[node]: node for node in nodes})
     added_blocks += _supports_of(probes)
@@ -129,10 +129,11 @@ def _mean_rotation(
 ) -> WeightedRows | None:
     """Return the weights of the mean rotation of a node's section, up to their common sign.
 
-    With the weights c and the eliminated row e, the motion of e is (rotation - sum of the other c_i
-    u_i) / c_e. The row of the rotation in the new stiffness is therefore K_ee / c_e^2 on the
-    diagonal, and (K_ei - K_ee c_i / c_e) / c_e beside it, which is solved for c. The result is None
-    if the moment makes no new unknown.
+    A deck with a moment at the node has this rotation as an unknown, in place of another unknown
+    u_e. From rotation = sum_i c_i u_i it follows that u_e = (rotation - sum of the other c_i u_i) /
+    c_e. In the new stiffness the row of the rotation therefore has K_ee / c_e^2 on the diagonal,
+    and (K_ei - K_ee c_i / c_e) / c_e elsewhere, where K is the stiffness without the moment. These
+    are solved for the weights c. The result is None if the moment makes no new unknown.
     """
     node, direction = dof
     loaded = jobs.matrices("moment", blocks, step_lines=("*CLOAD", f"{node},{direction},1."))
@@ -144,14 +145,14 @@ def _mean_rotation(
     eliminated = _eliminated_row(matrices, loaded, rotation, next(iter(lost_dofs)))
     if eliminated is None:
         return None
-    kept = np.delete(np.arange(len(matrices.dofs)), eliminated)
-    kept_in_loaded = np.delete(np.arange(len(loaded.dofs)), rotation)
+    other_rows = np.delete(np.arange(len(matrices.dofs)), eliminated)
+    other_rows_loaded = np.delete(np.arange(len(loaded.dofs)), rotation)
     old_row = matrices.stiffness[[eliminated]].toarray().ravel()
     new_row = loaded.stiffness[[rotation]].toarray().ravel()
     weights = np.empty(len(matrices.dofs))
     weights[eliminated] = np.sqrt(old_row[eliminated] / new_row[rotation])
-    difference = old_row[kept] - weights[eliminated] * new_row[kept_in_loaded]
-    weights[kept] = difference * weights[eliminated] / old_row[eliminated]
+    difference = old_row[other_rows] - weights[eliminated] * new_row[other_rows_loaded]
+    weights[other_rows] = difference * weights[eliminated] / old_row[eliminated]
     return _significant(weights)
 
 
@@ -160,7 +161,7 @@ def _eliminated_row(
 ) -> int | None:
     """Return the row that a rotation replaces; None if the order of the other rows differs.
 
-    Several rows may have the name of the lost one. Of those, it is the one without which the
+    If several rows belong to the lost degree of freedom, the replaced one is that without which the
     diagonals of both matrices have the most entries in common.
     """
     remaining = np.delete(loaded.stiffness.diagonal(), rotation)
@@ -186,27 +187,33 @@ def _with_signs(
     matrices: StoredMatrices,
     rotations: Mapping[Dof, WeightedRows],
 ) -> dict[Dof, WeightedRows]:
-    """Return the weights with the sign with which CalculiX moves the nodes under a moment.
+    """Give the weights of each rotation the sign with which CalculiX moves the nodes.
 
-    Torsion of a straight beam moves no node of the deck. The sign then follows from the positions
-    of the expanded nodes in the section, which the rotations about the two other axes show.
+    A moment in positive direction shows the sign by the displacements of the nodes. Torsion of a
+    straight beam moves no node of the deck. The sign then follows from the positions of the
+    expanded nodes in the section, which the rotations about the two other axes show. A rotation
+    whose sign remains unknown is left out.
     """
     if not rotations:
         return {}
-    known = _signs_by_displacements(jobs, blocks, matrices, rotations)
-    for dof, sign in list(known.items()):
+    signs_of_rotations = _signs_by_displacements(jobs, blocks, matrices, rotations)
+    for dof, sign in list(signs_of_rotations.items()):
         if sign != 0.0:
             continue
         node, direction = dof
-        others = {}
-        for other in ROTATIONS:
-            weights = _mean_rotation(jobs, blocks, matrices, (node, other))
-            if other != direction and weights is not None:
-                others[node, other] = weights
-        signs = _signs_by_displacements(jobs, blocks, matrices, others)
-        signed = {key: weights.times(signs[key]) for key, weights in others.items()}
-        known[dof] = _sign_by_section(matrices.dofs, dof, rotations[dof], signed)
-    return {dof: weights.times(known[dof]) for dof, weights in rotations.items() if known[dof]}
+        other_rotations = {}
+        for other_direction in ROTATIONS:
+            weights = _mean_rotation(jobs, blocks, matrices, (node, other_direction))
+            if other_direction != direction and weights is not None:
+                other_rotations[node, other_direction] = weights
+        signs = _signs_by_displacements(jobs, blocks, matrices, other_rotations)
+        signed = {key: weights.times(signs[key]) for key, weights in other_rotations.items()}
+        signs_of_rotations[dof] = _sign_by_section(matrices.dofs, dof, rotations[dof], signed)
+    return {
+        dof: weights.times(signs_of_rotations[dof])
+        for dof, weights in rotations.items()
+        if signs_of_rotations[dof]
+    }
 
 
 def _signs_by_displacements(
@@ -229,17 +236,17 @@ def _signs_by_displacements(
     reader = MotionReader(matrices.dofs)
     signs = {}
     for dof, solution, displacements in zip(rotations, solutions.T, printed, strict=True):
-        ours = []
-        theirs = []
+        values_solved = []
+        values_printed = []
         for node, displacement in displacements.items():
             for axis in TRANSLATIONS:
                 value = reader.displacement(solution, (node, axis))
                 if value is not None:
-                    ours.append(value)
-                    theirs.append(displacement[axis - 1])
-        largest = max(map(abs, ours), default=0.0)
+                    values_solved.append(value)
+                    values_printed.append(displacement[axis - 1])
+        largest = max(map(abs, values_solved), default=0.0)
         moves = largest > _SMALLEST_MOTION * np.abs(solution).max()
-        signs[dof] = float(np.sign(np.dot(ours, theirs))) if moves else 0.0
+        signs[dof] = float(np.sign(np.dot(values_solved, values_printed))) if moves else 0.0
     return signs
 
 
@@ -251,10 +258,10 @@ def _sign_by_section(
 ) -> float:
     """Return the sign of a rotation about an axis from those about the two other axes.
 
-    The mean rotation about a has the weights (a x p) / (m |p|^2) at an expanded node, where p is
-    its position in the section without the component along a, and m the number of expanded nodes.
-    Hence p is -(a x w) / |w|^2 up to a positive factor. The sign is 0 if the other rotations do not
-    show the positions.
+    The mean rotation about an axis a has the weights w = (a x p) / (m |p|^2) at each of m expanded
+    nodes, where p is the position of the node in the section without its component along a. Hence p
+    is -(a x w) / |w|^2 up to a positive factor. The sign is 0 if the other rotations do not show
+    the positions.
     """
     node, direction = dof
     axis = np.eye(3)[direction - 4]
@@ -296,19 +303,19 @@ def _rotations_of_rigid_sections(
     matrices: StoredMatrices,
     dofs: Sequence[Dof],
 ) -> dict[Dof, WeightedRows]:
-    """Return the weights of rotations that are unknowns already, as where beams meet shells.
+    """Return the weights of rotations that are unknowns already, such as where beams meet shells.
 
-    CalculiX makes such a section rigid. An equation lets an added node follow the rotation, and a
-    spring between it and a second added node shows the weights.
+    CalculiX makes such a section rigid. An equation lets an added node follow the rotation; a weak
+    spring between it and a second added node then shows the weights, as for a tied node.
     """
     if not dofs:
         return {}
-    first = _free_number(jobs)
+    first_added = _free_number(jobs)
     probes: list[_Probe] = []
     positions: dict[int, int] = {}
     added_blocks: list[KeywordBlock] = []
     for number, (node, direction) in enumerate(dofs):
-        follower = first + 2 * number
+        follower = first_added + 2 * number
         probe = _Probe((node, direction), follower + 1, 1)
         positions |= {follower: node, probe.added_node: node}
         terms = [str(text) for text in (follower, 1, 1.0, node, direction, -1.0)]
@@ -353,7 +360,7 @@ def _supports_of(probes: Sequence[_Probe]) -> list[KeywordBlock]:
 
 
 def _spring(jobs: CalculixJobs, number: int, first: Dof, second: Dof) -> list[KeywordBlock]:
-    """Return the blocks of a spring between two motions."""
+    """Return the blocks *ELEMENT and *SPRING of a weak spring between two degrees of freedom."""
     element = 3 * number + first[1]
     name = f"UAVPROBE{element}"
     ends = [str(element), str(first[0]), str(second[0])]
@@ -377,7 +384,10 @@ def _weights_of(
     matrices: StoredMatrices,
     probes: Sequence[_Probe],
 ) -> dict[Dof, WeightedRows]:
-    """Return the weights that springs show; empty if CalculiX fails or the rows differ."""
+    """Return the weights of each motion to which a spring was added, from the stored stiffness.
+
+    The result is empty if CalculiX fails, or if the springs change the rows of the matrices.
+    """
     try:
         probed = jobs.matrices("probes", blocks)
     except CalculixError:
@@ -386,14 +396,14 @@ def _weights_of(
     rows = [row for row, (node, _) in enumerate(probed.dofs) if node not in added_nodes]
     if not _are_same_rows(jobs, [probed.dofs[row] for row in rows], matrices.dofs):
         return {}
-    result = {}
+    weights_of_motions = {}
     for probe in probes:
         dof = (probe.added_node, probe.direction)
         column = probed.stiffness[[probed.dofs.index(dof)]].toarray().ravel()
         weights = -column[rows] / _PROBE_STIFFNESS
         if weights.any():
-            result[probe.motion] = _significant(weights)
-    return result
+            weights_of_motions[probe.motion] = _significant(weights)
+    return weights_of_motions
 
 
 def _are_same_rows(jobs: CalculixJobs, dofs: Sequence[Dof], expected: Sequence[Dof]) -> bool:

@@ -118,9 +118,9 @@ class LossCandidate(NamedTuple):
 def mass_places(structure: AffineStructure) -> list[MassCandidate]:
     """List the locations where a mass may be added or missing.
 
-    For a mesh these are its named sets of nodes, whose mean displacement the mass follows, and
-    points of a grid. For matrices they are the nodes that the structure file names. Locations that
-    the supports hold are left out.
+    In a mesh they are its named sets of nodes, whose mean displacement the mass then follows, and
+    the points of a coarse grid. In a structure of matrices they are the nodes that its file names.
+    Locations that the supports hold are left out.
     """
     if isinstance(structure, Structure):
         candidates = list(places_of_mesh(structure.mesh))
@@ -131,14 +131,14 @@ def mass_places(structure: AffineStructure) -> list[MassCandidate]:
     places = []
     for candidate in candidates:
         rows = sparse.kron(sparse.csr_array(candidate.weights[np.newaxis]), sparse.eye_array(3))
-        free_rows = (rows @ structure.expansion).tocsr()
+        unknown_rows = (rows @ structure.expansion).tocsr()
         slopes = sparse.kron(candidate.slopes, sparse.eye_array(3)) @ structure.expansion
         held_count = len([motion for motion in structure.support_motions if motion.spring == 0.0])
-        if abs(free_rows[:, : structure.unknowns - held_count]).max() > 0.0:
+        if abs(unknown_rows[:, : structure.unknowns - held_count]).max() > 0.0:
             places.append(
                 MassCandidate(
                     name=candidate.name,
-                    rows=free_rows,
+                    rows=unknown_rows,
                     point=candidate.point,
                     reach=candidate.reach,
                     axes=candidate.axes,
@@ -178,21 +178,21 @@ class MassPlace(NamedTuple):
 
 
 def places_of_mesh(mesh: StructureMesh) -> Iterator[MassPlace]:
-    """Yield the sets of nodes, then the points of a grid."""
+    """Yield the named sets of nodes, then the points of a coarse grid of nodes."""
     for name, nodes in mesh.node_sets.items():
         is_place = np.all(nodes >= 0) and len(nodes) < LARGEST_NODE_SHARE * len(mesh.points)
         if is_place and not name.startswith(SETS_OF_THE_MESHER):
             weights = set_weights(mesh, name, f"the set {name!r}")
             yield MassPlace.fixed(name, weights, weights @ mesh.points)
-    corners = np.unique(mesh.cells[:, : len(mesh.kind.corners)])
-    numbers = _spread_points(
-        mesh.points[corners], GRID_POINTS, LEAST_DISTANCE_OF_POINTS * mesh.size
+    corner_nodes = np.unique(mesh.cells[:, : len(mesh.kind.corners)])
+    grid_numbers = _spread_points(
+        mesh.points[corner_nodes], GRID_POINTS, LEAST_DISTANCE_OF_POINTS * mesh.size
     )
-    grid = mesh.points[corners[numbers]]
-    from_grid, _ = KDTree(grid).query(mesh.points)
-    reach = float(from_grid.max())
+    grid = mesh.points[corner_nodes[grid_numbers]]
+    distance_from_grid, _ = KDTree(grid).query(mesh.points)
+    reach = float(distance_from_grid.max())
     nodes_nearby = KDTree(mesh.points).query_ball_point(grid, FITTED_REACH * reach)
-    for node, neighbours in zip(corners[numbers].tolist(), nodes_nearby, strict=True):
+    for node, neighbours in zip(corner_nodes[grid_numbers].tolist(), nodes_nearby, strict=True):
         weights = np.zeros(len(mesh.points))
         weights[node] = 1.0
         point = mesh.points[node]
@@ -204,13 +204,15 @@ def places_of_mesh(mesh: StructureMesh) -> Iterator[MassPlace]:
 def _slopes_about(
     points: FloatArray, node: int, neighbours: IntArray, reach: float
 ) -> tuple[FloatArray, sparse.csr_array]:
-    """Return two axes (2, 3) at a node, and the weights (5, nodes) of derivatives along them.
+    """Return two axes at a node, (2, 3), and the weights of derivatives along them, (5, nodes).
 
-    The displacements of the neighbours, less that of the node, are fitted by a polynomial with the
-    distances along both axes to the second power, and that across both to the first. What the
-    neighbours do not determine, such as derivatives across a row of nodes, is taken as zero.
+    The derivatives are those of the displacement: d/ds, d/dt, d²/ds², d²/ds dt and d²/dt², with the
+    distances s and t along the axes, which are the principal axes of the neighbours. The
+    displacements of the neighbours relative to the node are fitted by a polynomial of second order
+    in s and t and of first order in the distance u across both. Derivatives that the neighbours do
+    not determine, such as those across a single row of nodes, are zero.
     """
-    arms = points[neighbours] - points[node]
+    arms = points[neighbours] - points[node]  # (neighbours, 3)
     _, _, axes = np.linalg.svd(arms - arms.mean(axis=0), full_matrices=True)
     s, t, u = axes @ arms.T / reach
     terms = np.column_stack((s, t, s**2 / 2.0, s * t, t**2 / 2.0, u))
@@ -223,9 +225,9 @@ def _slopes_about(
 
 
 def _places_of_nodes(structure: MatrixStructure) -> Iterator[MassPlace]:
-    """Yield each node that the design names."""
+    """Yield each node at which the structure file has a load, a mass or an output."""
     design = structure.design
-    named = []
+    named_nodes = []
     rows: tuple[MatrixLoad | MatrixMass | NodeOutput, ...] = (
         *design.load,
         *design.mass,
@@ -234,8 +236,8 @@ def _places_of_nodes(structure: MatrixStructure) -> Iterator[MassPlace]:
     )
     for row in rows:
         if row.node is not None:
-            named.append(row.node)
-    for node in dict.fromkeys(named):
+            named_nodes.append(row.node)
+    for node in dict.fromkeys(named_nodes):
         weights = np.zeros(len(structure.nodes))
         weights[structure.nodes.index(node)] = 1.0
         yield MassPlace.fixed(f"node {node}", weights, np.zeros(3))
@@ -269,10 +271,10 @@ def _spread_points(
 def loss_places(structure: AffineStructure) -> list[LossCandidate]:
     """List the patches of a mesh that may have lost stiffness, outside its damage regions.
 
-    These are its small named sets of cells and, on all other cells, the Voronoi cells of a coarse
-    grid. Gauges are grid points where possible: a loss below a gauge changes its strain most, which
-    would not show if the gauge were at the edge of its patch. A structure from matrices has no
-    patches.
+    These are its small named sets of cells; the other cells are divided into the Voronoi cells of a
+    coarse grid. Where possible the gauges are points of this grid: a loss below a gauge changes its
+    strain most, which would not show if the gauge were at the edge of a patch. A structure of
+    matrices has no patches.
     """
     if not isinstance(structure, Structure):
         return []
@@ -310,20 +312,20 @@ def patches_of_mesh(
         if is_small and is_free_cell[cells].all() and not name.startswith(SETS_OF_THE_MESHER):
             patches[name] = cells
             is_free_cell[cells] = False
-    remaining = np.flatnonzero(is_free_cell)
-    if len(remaining):
-        centres = mesh.centres[remaining]
+    unnamed_cells = np.flatnonzero(is_free_cell)
+    if len(unnamed_cells):
+        centres = mesh.centres[unnamed_cells]
         gauge_cells = cells_at_gauges(mesh, gauges)
         centre_cells = _spread_points(
             centres,
             GRID_PATCHES,
             LEAST_DISTANCE * mesh.size,
-            preferred=np.searchsorted(remaining, gauge_cells[is_free_cell[gauge_cells]]),
+            preferred=np.searchsorted(unnamed_cells, gauge_cells[is_free_cell[gauge_cells]]),
         )
         _, patch_of = KDTree(centres[centre_cells]).query(centres)
         for number, centre_cell in enumerate(centre_cells):
             name = f"around {mesh.describe_point(np.round(centres[centre_cell], 4))}"
-            patches[name] = remaining[patch_of == number]
+            patches[name] = unnamed_cells[patch_of == number]
     return patches
 
 
@@ -353,10 +355,10 @@ class LoadChange(NamedTuple):
 
 
 def load_changes(structure: AffineStructure) -> list[LoadChange]:
-    """Return the derivatives of each force whose control is in newtons.
+    """Return how the load vector of each force changes if the force is tilted or offset.
 
-    Every such force may be tilted; one that acts at a point may also be offset on the surface or
-    inside.
+    Only forces whose control is in newtons may change. Each of them may be tilted towards each
+    axis; a force at a point may also be offset along each axis, on the surface or inside.
     """
     if not isinstance(structure, Structure):
         return []
@@ -368,11 +370,11 @@ def load_changes(structure: AffineStructure) -> list[LoadChange]:
         force = np.asarray(load.force)
         weights = force_weights(mesh, load, label)
         for axis, direction in zip(AXES, np.eye(3), strict=True):
-            across = direction - force * (force @ direction) / (force @ force)
-            length = float(np.linalg.norm(across))
+            perpendicular = direction - force * (force @ direction) / (force @ force)
+            length = float(np.linalg.norm(perpendicular))
             if length > LEAST_SINE:
-                tilted = np.linalg.norm(force) * across / length
-                vector = structure.expansion.T @ np.outer(weights, tilted).ravel()
+                tilted_force = np.linalg.norm(force) * perpendicular / length
+                vector = structure.expansion.T @ np.outer(weights, tilted_force).ravel()
                 no_curvature = np.zeros_like(vector)
                 changes.append(LoadChange(load.control, "tilt", axis, vector, no_curvature))
             derivatives = _derivatives_of_weights(mesh, load, direction, label)
@@ -390,19 +392,20 @@ def _derivatives_of_weights(
 ) -> tuple[FloatArray, FloatArray] | None:
     """Return first and second derivative (nodes,) of the load's nodal weights along a direction.
 
-    They are those of a parabola through three points, or of a line where one side lies outside the
-    structure, and None where both do.
+    They are those of a parabola through three points: the point of the load, and one on either
+    side. If one side lies outside the structure, they are those of a line; if both do, the result
+    is None.
     """
     if load.point is None:
         return None
     step = OFFSET_STEP * mesh.size
-    middle = point_weights(mesh, load.point, label)
+    weights_at_load = point_weights(mesh, load.point, label)
     difference_quotients = []
     for distance in (step, -step):
         point = np.asarray(load.point) + distance / mesh.unit * direction
         with suppress(InvalidDesignError):
             weights = point_weights(mesh, tuple(point.tolist()), label)
-            difference_quotients.append((weights - middle) / distance)
+            difference_quotients.append((weights - weights_at_load) / distance)
     if not difference_quotients:
         return None
     slope = 0.5 * (difference_quotients[0] + difference_quotients[-1])
@@ -411,9 +414,10 @@ def _derivatives_of_weights(
 
 
 def strains_across(structure: AffineStructure) -> list[sparse.csr_array]:
-    """Return rows (G, n) of the transverse strains, and of the shear strains, at the gauges.
+    """Return the matrices (G, n) of the transverse strains and of the shear strains at G gauges.
 
-    With the strain e45 halfway between both directions the shear strain is 2 e45 - e - e_across.
+    The shear strain is 2 e45 - e - e_across, where e is the strain along the gauge, e_across the
+    strain at 90 degrees to it, and e45 that at 45 degrees.
     """
     if not isinstance(structure, Structure):
         no_rows = sparse.csr_array((0, structure.unknowns))
@@ -422,8 +426,8 @@ def strains_across(structure: AffineStructure) -> list[sparse.csr_array]:
     factors = strain_factors(structure.mesh, structure.design)
     rows = []
     for turn in (0.5 * np.pi, 0.25 * np.pi):
-        turned, _ = gauge_rows(structure.mesh, structure.design.gauge, turn, factors=factors)
-        rows.append((turned @ structure.expansion).tocsr())
+        turned_rows, _ = gauge_rows(structure.mesh, structure.design.gauge, turn, factors=factors)
+        rows.append((turned_rows @ structure.expansion).tocsr())
     across, halfway = rows
     return [across, (2.0 * halfway - along - across).tocsr()]
 
@@ -449,8 +453,9 @@ class GaugeShift(NamedTuple):
 def gauge_shifts(structure: AffineStructure) -> list[GaugeShift]:
     """Return the derivatives of the strain at each gauge with respect to its position.
 
-    They are those of a parabola through three positions. Where the gauge would reach over an edge
-    on one side, they are those of the line through the other two; where on both, there are none.
+    They are those of a parabola through three positions of the gauge. If it would reach over an
+    edge on one side, they are those of a line through the other two positions; if on both sides,
+    there are none.
     """
     if not isinstance(structure, Structure):
         return []
@@ -459,14 +464,14 @@ def gauge_shifts(structure: AffineStructure) -> list[GaugeShift]:
     shifts = []
     factors = strain_factors(mesh, structure.design).tolist()
     for gauge, factor in zip(structure.design.gauge, factors, strict=True):
-        middle, _ = gauge_rows(mesh, (gauge,))
+        rows_at_gauge, _ = gauge_rows(mesh, (gauge,))
         for axis, direction in GAUGE_AXES.items():
             difference_quotients = []
             for distance in (step, -step):
                 offset = (distance * direction[0], distance * direction[1])
                 with suppress(InvalidDesignError):
                     rows, _ = gauge_rows(mesh, (gauge,), offset=offset)
-                    difference_quotients.append((rows - middle) / distance)
+                    difference_quotients.append((rows - rows_at_gauge) / distance)
             if not difference_quotients:
                 continue
             slope = (difference_quotients[0] + difference_quotients[-1]) / 2.0

@@ -65,10 +65,10 @@ def read_by_meshio(path: Path) -> Deck:
 
 
 def _add_elements(deck: Deck, mesh: Mesh) -> list[IntArray]:
-    """Add the elements of a mesh; return their numbers in the deck, an array for each block.
+    """Add the elements of a mesh to a deck; return their numbers, an array for each block.
 
-    Elements outside the physical groups of Gmsh get the number `_LEFT_OUT`. Elements that occur
-    twice in a file of Gmsh share a number.
+    Elements outside the physical groups of Gmsh are not added and have the number `_LEFT_OUT`. An
+    element that occurs several times in a file of Gmsh is added once.
     """
     suffix = deck.path.suffix.lower()
     outside_blocks = _outside_physical_groups(mesh)
@@ -122,10 +122,16 @@ class _NamedArrays(NamedTuple):
 def _add_sets(
     deck: Deck, mesh: Mesh, kind: str, numbers: IntArray, arrays: _NamedArrays, block: int
 ) -> None:
-    """Add the sets of the nodes, or of one block of elements.
+    """Add to a deck the named sets of its nodes, or of the elements of one block.
 
-    `kind` is "NSET" or "ELSET"; `numbers` (n,) are the numbers of the nodes or elements in the
-    deck; `block` is the index in the lists of `arrays`.
+    Parameters
+    ----------
+    kind : {"NSET", "ELSET"}
+        Sets of nodes or of elements.
+    numbers : (n,) array of int
+        The numbers of the nodes or elements in the deck.
+    block : int
+        The index of the block in the lists of `arrays`; 0 for nodes.
     """
     named_sets: list[tuple[str, IntArray]] = []
     for name, members in arrays.sets.items():
@@ -150,8 +156,8 @@ def _sets_of_values(
 ) -> Iterator[tuple[str, IntArray]]:
     """Yield the name and the member indices of each set that an array of integers defines.
 
-    A set holds the nodes or elements of one value. `label` is the name of the array, such as
-    "gmsh:physical" or "cell_tags".
+    The nodes or elements with the same integer are one set. An array with too many different
+    integers defines none. `label` is the name of the array, such as "gmsh:physical" or "cell_tags".
     """
     array = np.asarray(arrays[block])
     if array.ndim != 1 or not np.issubdtype(array.dtype, np.integer):
@@ -196,9 +202,10 @@ def _names_of_value(mesh: Mesh, label: str, value: int, block: int) -> list[str]
 def _outside_physical_groups(mesh: Mesh) -> list[BoolArray]:
     """Return for each block of a mesh from Gmsh which elements are not part of the structure.
 
-    Gmsh also writes elements without a physical group, as group 0, if its option Mesh.SaveAll is
-    set. They are construction geometry if other elements of their dimension have a group. If no
-    solid element has one, the groups name faces only, and all solid elements are the structure.
+    If its option Mesh.SaveAll is set, Gmsh also writes elements without a physical group, as group
+    0. A face without a group is left out if any element has a group. A solid element without a
+    group is left out only if some solid element has one: otherwise the groups name faces only, and
+    all solid elements are the structure.
     """
     groups = mesh.cell_data.get("gmsh:physical")
     if groups is None:
@@ -208,12 +215,12 @@ def _outside_physical_groups(mesh: Mesh) -> list[BoolArray]:
     for block, group in zip(mesh.cells, groups, strict=True):
         if block.type not in FLAT and np.any(group):
             any_solid_has_group = True
-    outside = []
+    outside_blocks = []
     for block, group in zip(mesh.cells, groups, strict=True):
         groups_choose_elements = any_has_group if block.type in FLAT else any_solid_has_group
         has_no_group = np.asarray(group) == 0
-        outside.append(has_no_group & groups_choose_elements)
-    return outside
+        outside_blocks.append(has_no_group & groups_choose_elements)
+    return outside_blocks
 
 
 _PARAMETRIC = (

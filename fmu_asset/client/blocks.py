@@ -70,7 +70,11 @@ class _SelectedInput(NamedTuple):
 def _selected_inputs(
     fmu: BoundFmu, ports: Sequence[PortQuantity], faults: BindingFaults
 ) -> list[_SelectedInput]:
-    """Return all inputs and port inputs that are sent at every step."""
+    """Return the inputs that are sent at every step: those of the binding, then those of ports.
+
+    Inputs of `health` that the FMU accepts only at its start are left out. Errors are collected in
+    `faults`.
+    """
     inputs = []
     for role in INPUT_ROLES:
         for name, entry in fmu.binding.inputs(role).items():
@@ -226,7 +230,7 @@ class Request:
         for variable in self.layout.variables:
             is_whole = variable.name in whole_arrays
             block += start_values(self._fmu.description, variable, placeholders=is_whole)
-        # linear inputs begin at the start values, too; their begins are the last part of the block
+        # Linear inputs also begin the step at the start values, which the end of the block holds.
         return block + block[REQUEST_HEAD : REQUEST_HEAD + linear_count]
 
     def write(self, block: NumberBlock, inputs: InputsByRole) -> bool:
@@ -312,7 +316,7 @@ def _plain_inputs(bound_inputs: Mapping[str, BoundInput]) -> dict[str, _PlainInp
 
 
 def step_count(histories: Sequence[tuple[BoundInput, Float]], steps: int | None) -> int:
-    """Return the number of steps; check that all histories and the caller agree on it.
+    """Return the number of steps, on which all histories and `steps` must agree.
 
     Parameters
     ----------
@@ -450,7 +454,10 @@ def _observed_outputs(fmu: BoundFmu, faults: BindingFaults) -> list[_BoundOutput
 def _extra_outputs(
     fmu: BoundFmu, ports: Sequence[PortQuantity], faults: BindingFaults
 ) -> list[_BoundOutput]:
-    """Return the further outputs: monitors, recorded variables and outputs of ports."""
+    """Return the outputs other than observations: monitors, recorded variables, outputs of ports.
+
+    Errors are collected in `faults`.
+    """
     outputs = []
     for name, scalar in fmu.binding.monitor.items():
         label = f"monitor.{name}"
@@ -520,10 +527,10 @@ class Blocks:
         self.plan = self._plan(configuration)
 
     def _plan(self, configuration: list[InitialValue]) -> Plan:
-        """Return the plan of the instance, whose folder is not known yet.
+        """Return the plan by which a worker starts the instance; its folder is not known yet.
 
-        If the binding states no tolerance, our solver uses the smaller of the declared one and its
-        default.
+        If the binding states no tolerance, the FMU gets the tolerance that it declares; the solver
+        for model exchange then uses the smaller of this and `SOLVER_TOLERANCE`.
         """
         description = self.description
         header = self.binding.binding

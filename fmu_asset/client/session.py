@@ -288,10 +288,11 @@ class FmiAsset:
         self._start(request, health, with_inputs=with_inputs, renewed=renewed)
 
     def _restart_if_health_changes(self, inputs: InputsByRole) -> InputsByRole:
-        """Start the FMU again if the health changes, and return the other inputs.
+        """Start the FMU again if an input of `health` changes; return the inputs still to be set.
 
-        Only health that the FMU accepts before its initialisation alone is meant. The new start is
-        made at the present time with the present inputs; earlier states can no longer be replayed.
+        This concerns those inputs of `health` that the FMU accepts only before its initialisation.
+        The FMU starts again at the present time with the present inputs, so that states before this
+        time can no longer be restored by a replay of all inputs.
         """
         running = self._running
         inputs, changed_health = self._blocks.initial_values.split_inputs(inputs)
@@ -487,16 +488,19 @@ class FmiAsset:
     def _simulate(
         self, histories: InputsByRole, steps: int | None, progress: Progress | None
     ) -> ObservationHistory:
-        """Make the steps of `simulate` that need no new start."""
+        """Make the steps of `simulate` without starting the FMU again, and return the outputs.
+
+        If the FMU ends early, the history ends with its last outputs.
+        """
         self._open(histories)
         running = self._running
-        first_index = running.step_index
+        steps_before = running.step_index
         requests = running.requests_of_steps(histories, steps)
         times = running.times(len(requests))
         replies = np.full((len(requests), len(running.host.reply)), np.nan)
         with reporter(progress).stage("Simulating", total=len(requests), unit="steps") as stage:
             early_end = running.run(requests, replies, stage)
-        steps_made = running.step_index - first_index
+        steps_made = running.step_index - steps_before
         if early_end is None:
             running.host.reply[:] = replies[steps_made - 1]
             running.finite_reply(f" It was step {running.step_index - 1}.")

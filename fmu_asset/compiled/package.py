@@ -40,9 +40,9 @@ _NOT_IN_DATA_FILE = ("nominal", "damping", "validity_box", "followed_shapes")
 def data_file_bytes(model: ReducedArrays) -> bytes:
     """Return the data file from which a compiled FMU reads its reduced model.
 
-    It consists of magic, version, arrays and CRC-32. The arrays of the model are written under
-    their names, scalars as arrays without dimension, and names as their counts; empty arrays are
-    left out. Equal models give equal bytes.
+    Each array of the model is written under its name, and a scalar as an array without dimension.
+    Of names (parameters, regions, masses, controls, gauges) only the counts are written. Empty
+    arrays are left out. Equal models give equal bytes. `pack_arrays` defines the layout.
     """
     values: dict[str, object] = {}
     for field in fields(ReducedArrays):
@@ -61,7 +61,7 @@ def data_file_bytes(model: ReducedArrays) -> bytes:
 
 
 def pack_arrays(arrays: Mapping[str, FloatArray]) -> bytes:
-    """Return arrays by name as a data file, which the sources of a compiled FMU read.
+    """Return the bytes of a data file with the given arrays: magic, version, arrays and CRC-32.
 
     Parameters
     ----------
@@ -86,7 +86,7 @@ STATES = {"modal_displacement": "Coordinate", "modal_velocity": "Rate of the coo
 def exchange_table(
     table: Sequence[FmuVariable], mode_count: int, *, arrays: bool = False
 ) -> tuple[FmuVariable, ...]:
-    """Return the variables of an FMU for model exchange, in which the modes are states.
+    """Convert the variables of an FMU for co-simulation to those of one for model exchange.
 
     Parameters
     ----------
@@ -95,14 +95,14 @@ def exchange_table(
     mode_count : int
         Number M of modes.
     arrays : bool
-        Whether the rows become arrays, with derivatives that are arrays, too.
+        Whether the states are declared as arrays (FMI 3), with derivatives that are arrays, too.
 
     Returns
     -------
     tuple of FmuVariable
-        The same variables with discrete health and transient response, then 2 M states
-        (mass-normalised coordinates of the modes and their rates), then the 2 M derivatives of the
-        states.
+        The given variables, of which the health inputs become discrete and `response` starts as
+        transient; then the 2 M states (mass-normalised coordinates of the modes, and their rates);
+        then the 2 M derivatives of the states.
     """
     rows = []
     for row in table:
@@ -249,9 +249,9 @@ def _common_sources(fmi: FmiVersion) -> dict[str, bytes]:
 
 
 def fmi_headers(fmi: FmiVersion = 2) -> dict[str, bytes]:
-    """Return the headers of a version of FMI by name, as fmpy ships them.
+    """Return the C headers of a version of FMI by file name, as the package fmpy ships them.
 
-    Their licence (2-clause BSD) is in them.
+    Each contains its licence (2-clause BSD).
 
     Raises
     ------

@@ -143,12 +143,12 @@ class StructureOfFile(AssetSource):
     def write_field(
         self, path: Path, state: Mapping[str, float], control: Mapping[str, float]
     ) -> bool:
-        """Write displacement and strain of the full structure as VTU, if it has a mesh.
+        """Write displacement and strain of the full structure to a VTU file, if it has a mesh.
 
         Parameters
         ----------
         path : Path
-            A file in the folder of the VTU file, which is called `structure.vtu`.
+            Any path in the folder of the VTU file, which is always called `structure.vtu`.
         state : mapping of str to float
             The estimated value of each state factor, SI.
         control : mapping of str to float
@@ -245,8 +245,8 @@ class StructureOfFile(AssetSource):
     def _check_parameter(self, *, believed: bool) -> None:
         """Refuse a calibration whose source, parameters or design do not fit the structure.
 
-        The design is compared only if the twin believes the structure; the structure that flies may
-        differ from the calibrated one.
+        `believed` is true for the structure that the twin takes as its model. Only then must the
+        design be the calibrated one: the structure that flies may differ from it.
         """
         calibration = self._scenario.calibration
         if calibration.source == "static_test" and self.advice.static_test:
@@ -259,11 +259,11 @@ class StructureOfFile(AssetSource):
             advice=self.advice.calibration,
             design_hash=self.design_hash if believed else "",
         )
-        names_by_sort = [("parameter", [calibration.parameter], self.parameter_names)]
+        parameter_names = [("parameter", [calibration.parameter], self.parameter_names)]
         check_names(
             "the scenario calibrates the",
             self.full_name,
-            names_by_sort,
+            parameter_names,
             advice=self.advice.parameter,
         )
 
@@ -282,7 +282,10 @@ class StructureOfFile(AssetSource):
                 )
 
     def _chosen_values(self, parameters: Mapping[str, float]) -> Iterator[ChosenValue]:
-        """Yield the values that the scenario gives to inputs of the structure."""
+        """Yield each value that the scenario gives to an input of the structure, with its source.
+
+        `parameters` are values of calibrated or fixed parameters, by name.
+        """
         scenario = self._scenario
         for name, value in parameters.items():
             yield ChosenValue(f"parameter {name}", name, value)
@@ -380,7 +383,7 @@ class ReducedModelSource(StructureOfFile):
         return slice(gauge_count, None)
 
     def observation_table(self, draws: ParameterDraws, model: GraphicalModel) -> Float:
-        """Return the predicted observations: strains, displacements, or features of modes.
+        """Predict the observations (strains, displacements or features of modes) of every case.
 
         See Kapteyn et al. 2021, eqs. (13) and (15). Natural frequencies are in rising order.
         Features of modes do not depend on the control, and are repeated for each control.

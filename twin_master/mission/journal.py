@@ -117,7 +117,8 @@ KEPT_OF_SUSPICION = ("none_of_these", "hypotheses", "decided_by")
 def step_record(step: MissionStep) -> JsonObject:
     """Return the record of a step for the journal.
 
-    It contains the belief, so that a viewer need not filter the observations again. Beliefs and
+    It contains the belief, so that a viewer need not filter the observations again. The state, the
+    noise-free observation and the monitors are added if the asset is simulated. Beliefs and
     evidence are rounded, see `rounded_probabilities` and `rounded`.
     """
     twin_step = step.twin_step
@@ -169,7 +170,7 @@ def short_record(
     is_whole: bool,
     kept_of_suspicion: Sequence[str] = KEPT_OF_SUSPICION,
 ) -> JsonObject:
-    """Return a record without its large parts, as most lines of the journal contain it.
+    """Return a record without its large parts, which is what most lines of the journal contain.
 
     Parameters
     ----------
@@ -180,21 +181,24 @@ def short_record(
     kept_of_suspicion : sequence of str
         The entries of the suspicion that the line keeps.
     """
-    short = {name: value for name, value in record.items() if name not in LARGE_PARTS}
+    short_record_of_step = {
+        name: value for name, value in record.items() if name not in LARGE_PARTS
+    }
     if is_whole and "learnt" in record:
-        short["learnt"] = record["learnt"]
+        short_record_of_step["learnt"] = record["learnt"]
     if "suspicion" in record:
         suspicion = record["suspicion"]
-        short["suspicion"] = {name: suspicion[name] for name in kept_of_suspicion}
-    return short
+        short_record_of_step["suspicion"] = {name: suspicion[name] for name in kept_of_suspicion}
+    return short_record_of_step
 
 
 def with_short_truth(record: JsonObject, noise_free: NoiseFree) -> JsonObject:
-    """Return the record of a simulated step with its true observation in a short form.
+    """Shorten the record of a simulated step: store only a difference for its true observation.
 
-    The true observation is the observed one without noise and drift, up to rounding. Their
-    difference in units in the last place is a small number for each sensor, unless the sensor is
-    lost. If the asset has noise of its own, the record is returned as it is.
+    The observation without noise and drift can be computed from the observed values, up to
+    rounding. The record keeps only the rounding error, in units in the last place: a small number
+    for each sensor. If the differences are long, because the asset has noise of its own or a sensor
+    is lost, the record is returned as it is.
 
     Parameters
     ----------
@@ -208,8 +212,8 @@ def with_short_truth(record: JsonObject, noise_free: NoiseFree) -> JsonObject:
     digits = sum(len(str(number)) for number in difference)
     if digits > _LONGEST_DIFFERENCE * len(difference):
         return record
-    short = {name: value for name, value in record.items() if name != "observation"}
-    return short | {"observation_difference": difference}
+    remaining_record = {name: value for name, value in record.items() if name != "observation"}
+    return remaining_record | {"observation_difference": difference}
 
 
 def _true_observation(record: JsonObject, observed: Float, noise_free: NoiseFree | None) -> Float:
@@ -539,7 +543,7 @@ def last_step(path: Path, limit: float = math.inf) -> tuple[int, int]:
 
 
 def damaged_line_error(path: Path, begin: int, reason: str) -> NotResumableError:
-    """Return the error that names a damaged line, with the number of valid lines around it.
+    """Return the error that names a damaged line and counts the valid lines before and after it.
 
     Parameters
     ----------

@@ -193,9 +193,9 @@ class StateSpace:
     def change_within_interval(self, table: ArrayLike) -> Float:
         """Return how much a table typically changes within the interval that a state stands for.
 
-        A level stands for the values that are nearest to it, half way to its neighbours; the first
-        and the last level have a neighbour on one side only. The true value is uniformly
-        distributed in this interval, and the table is linear between levels.
+        A level stands for the interval of values that are nearest to it: half way to its
+        neighbours, and on one side only for the first and the last level. The true value is taken
+        as uniformly distributed in this interval, and the table as linear between levels.
 
         Parameters
         ----------
@@ -243,16 +243,18 @@ class StateSpace:
 
 
 def _change_within_interval(values: Float, levels: tuple[float, ...]) -> Float:
-    """Return the change (..., L) of values (..., L) at one standard deviation off each level.
+    """Return how much a function of a factor changes one standard deviation off each level.
 
-    The distance x of the true value from the level is uniform between half a step below and half a
-    step above. With the value v at the level and slopes on either side, the least-squares slope
-    through the level is m / q, where m is the integral of x (v(x) - v), and q that of x². The
-    change is this slope times the root mean square of x, which is sqrt(q / w) in an interval of
-    width w: m / sqrt(q w).
+    `values` (..., L) are the function at the L levels, between which it is linear; the result has
+    the same shape. The distance x of the true factor from its level is uniform, from half way to
+    the level below to half way to the level above.
 
-    A step h to a neighbour, over which the value changes by d, contributes its nearer half: h² d to
-    24 m, h³ to 24 q, and h to 2 w.
+    With v the value at the level, m the integral of x (v(x) - v), and q that of x², the
+    least-squares slope through the level is m / q. The change is this slope times the root mean
+    square of x, which is sqrt(q / w) in an interval of width w; hence it is m / sqrt(q w).
+
+    For a neighbour at the distance h, to which the function changes by d, the nearer half of the
+    way contributes h² d / 24 to m, h³ / 24 to q, and h / 2 to w.
     """
     # The steps between levels, (L + 1,), and the differences of the values over them, (..., L + 1):
     # zero beyond the first and the last level, which have no neighbour there.
@@ -313,9 +315,9 @@ class GraphicalModel:
         tables: Mapping[str, Mapping[str, ArrayLike]],
         prior: Mapping[str, ArrayLike] | None = None,
     ) -> GraphicalModel:
-        """Return the model of factors that change independently, given the control.
+        """Return the model of a state whose factors change independently of each other.
 
-        Kapteyn et al. 2021, eqs. (28)-(29).
+        Each control has transition tables of its own. Kapteyn et al. 2021, eqs. (28)-(29).
 
         Parameters
         ----------
@@ -403,7 +405,9 @@ def worsening_table(level_count: int, probability: float) -> Float:
 
 
 def repaired_table(table: Float, success: float) -> Float:
-    """Return the transitions (L, L) of a step at whose end a repair to the lowest level is tried.
+    """Return the transition table (L, L) of a step that ends with an attempt at a repair.
+
+    A repair that succeeds sets the factor to its lowest level.
 
     Parameters
     ----------
@@ -420,7 +424,9 @@ def repaired_table(table: Float, success: float) -> Float:
 
 
 def leaving_table(table: Float, factor: float) -> Float:
-    """Return transitions (L, L) with each probability of leaving a level multiplied by a factor.
+    """Multiply each probability of leaving a level by a factor; return the transition table (L, L).
+
+    The probability of staying at the level becomes the rest to one.
 
     Raises
     ------
@@ -443,7 +449,7 @@ def leaving_table(table: Float, factor: float) -> Float:
 def factor_tables(
     scenario: Scenario, leaving_multiplier: float = 1.0
 ) -> dict[str, dict[str, Float]]:
-    """Return the transition table of each state factor under each control, with repairs by actions.
+    """Return the transition table of each state factor under each control, repairs included.
 
     Parameters
     ----------

@@ -280,7 +280,7 @@ class GaussianSensorModel(QuantityModel):
             The sensor values with noise, SI.
         """
         count = len(state)
-        # With the average inside, each sensor has a draw of its own.
+        # With the average inside the product over sensors, eq. (32), each sensor has its own draw.
         draws_per_row = self.sensor_count if self.averages_inside else 1
         draw = generator.choice(self.draw_count, (count, draws_per_row), p=self.draw_weight)
         sensors = np.arange(self.sensor_count)
@@ -529,9 +529,10 @@ class GaussianSensorModel(QuantityModel):
         )
 
     def worst_residuals(self, observation: ArrayLike, control_index: int) -> dict[str, float]:
-        """Return the residuals of the sensors that fit worst, in the state that fits best.
+        """Return the largest residuals of an observation, in the state that fits it best.
 
-        They are in standard deviations, by names such as "sensor 1".
+        This is the state with the smallest sum of absolute residuals. The residuals are in standard
+        deviations, the largest first, by names such as "sensor 1".
         """
         observation = np.asarray(observation)[: self.sensor_count]
         predicted_values = self.mean[:, control_index]
@@ -567,10 +568,10 @@ class GaussianSensorModel(QuantityModel):
 def _steps_by_group(
     control: Index, is_present: NDArray[np.bool_]
 ) -> dict[tuple[int, bytes], Index]:
-    """Return the steps that have the same control and the same present sensors, by both.
+    """Group the steps that have the same control and the same present sensors.
 
-    The present sensors are given as the bytes of an array of bool, because an array cannot be a
-    key.
+    The key of a group is the control, and `is_present` of its steps as bytes (an array cannot be
+    part of a key); its value holds the numbers of its steps.
 
     Parameters
     ----------
@@ -582,8 +583,8 @@ def _steps_by_group(
     if len(control) > _MANY_STEPS and bool(np.all(is_present == is_present[0])):
         present_key = is_present[0].tobytes()
         return {
-            (value, present_key): np.flatnonzero(control == value)
-            for value in np.unique(control).tolist()
+            (control_of_group, present_key): np.flatnonzero(control == control_of_group)
+            for control_of_group in np.unique(control).tolist()
         }
     steps_by_group: dict[tuple[int, bytes], list[int]] = {}
     for step, control_in_force in enumerate(control.tolist()):

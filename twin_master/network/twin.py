@@ -78,7 +78,7 @@ class DecisionRule:
         *,
         predicted: Float | None = None,
     ) -> Float:
-        """Return the probability of each next control by the policy alone: (B, U).
+        """Return the probability (B, U) of each next control by the policy alone, for B twins.
 
         Parameters
         ----------
@@ -99,13 +99,13 @@ class DecisionRule:
             belief = predicted
         # A policy on the belief is deterministic: its control has the probability one. A twin whose
         # flight has failed has no belief, and its control is not used.
-        certain = np.eye(self.policy.shape[1])
+        one_hot = np.eye(self.policy.shape[1])
         if isinstance(self.on_belief, RiskPolicy):
             # The risk contains the case that no state explains the sensors.
             doubt_of_twin = 0.0 if unexplained is None else np.nan_to_num(unexplained)
-            return np.asarray(certain[self.on_belief.decide(np.nan_to_num(belief), doubt_of_twin)])
+            return np.asarray(one_hot[self.on_belief.decide(np.nan_to_num(belief), doubt_of_twin)])
         if self.on_belief is not None:
-            probability = certain[self.on_belief.decide(np.nan_to_num(belief))]
+            probability = one_hot[self.on_belief.decide(np.nan_to_num(belief))]
         else:
             probability = product_of_each(belief, self.policy)
         if unexplained is None or self.safest is None:
@@ -116,10 +116,15 @@ class DecisionRule:
     def decide(
         self, probability: Float, control: Index, proposals_before: Index
     ) -> tuple[Float, Index, Index]:
-        """Return the decisions of B twins, given the probabilities (B, U) by the policy.
+        """Decide on the next control of each of B twins: the most probable one.
+
+        If the policy has a `Hold`, a change to a harder control waits until it was proposed often
+        enough in a row.
 
         Parameters
         ----------
+        probability : (B, U) array
+            The probability of each next control by the policy.
         control : (B,) array
             The indices of the controls in force.
         proposals_before : (B,) array
@@ -371,23 +376,23 @@ class Twin:
             rows.append((self.observed(later_step), self.control_of(later_step)))
         return self._assimilate_from(step, rows)
 
-    def _assimilate_from(self, first: int, rows: Sequence[tuple[Float, int]]) -> TwinStep:
-        """Filter observations under their controls from a step on, and decide on the next control.
+    def _assimilate_from(self, first_step: int, rows: Sequence[tuple[Float, int]]) -> TwinStep:
+        """Filter the observations of consecutive steps, and decide on the next control.
 
         Parameters
         ----------
-        first : int
+        first_step : int
             The step of the first observation; it and later steps are replaced.
         rows : sequence of (G,) array and int
             The observation and the control in force of each step.
         """
-        kept_before = first - self._first_in_memory
-        step_before = self._kept_steps[kept_before - 1] if kept_before else None
+        kept_count_before = first_step - self._first_in_memory
+        step_before = self._kept_steps[kept_count_before - 1] if kept_count_before else None
         previous_carried = step_before.carried if step_before else None
         proposals = step_before.proposals if step_before else 0
         new_steps: list[_KeptStep] = []
         notices: list[Notice] = []
-        for step, (observation, control_index) in enumerate(rows, start=first):
+        for step, (observation, control_index) in enumerate(rows, start=first_step):
             try:
                 with np.errstate(over="ignore", invalid="ignore"):
                     estimate = self.estimator.step(
@@ -396,9 +401,13 @@ class Twin:
             except (ArithmeticError, np.linalg.LinAlgError):
                 raise unbelievable_observation(self.name, step) from None
             previous_carried = estimate.carried
-            results = (estimate.log_evidence, estimate.filtered, *previous_carried.arrays.values())
+            checked_values = (
+                estimate.log_evidence,
+                estimate.filtered,
+                *previous_carried.arrays.values(),
+            )
             # False for NaN as well.
-            if not all(np.all(np.asarray(values) < LARGEST_CARRIED) for values in results):
+            if not all(np.all(np.asarray(values) < LARGEST_CARRIED) for values in checked_values):
                 raise unbelievable_observation(self.name, step)
             proposals_before = proposals
             if self.decision_rule.hold is not None:
@@ -406,10 +415,10 @@ class Twin:
             new_steps.append(_KeptStep(observation, previous_carried, proposals))
             notices += estimate.notices
         # From here on nothing fails, so that a refused observation leaves the twin unchanged.
-        for _ in range(len(self._kept_steps) - kept_before):
+        for _ in range(len(self._kept_steps) - kept_count_before):
             self._kept_steps.pop()
         self._kept_steps.extend(new_steps)
-        self._steps = first + len(rows)
+        self._steps = first_step + len(rows)
         return self._decide(replace(estimate, notices=tuple(notices)), proposals_before)
 
     def observed(self, step: int) -> Float:

@@ -262,17 +262,20 @@ def _damage_sentence(overviews: Sequence[GroupOverview]) -> str:
 def _watched_fleet_page(
     page: Page, folder: Path, groups: Sequence[JsonObject], most_assets: int
 ) -> Page:
-    """Return the page of a fleet that is watched, given the records of its groups."""
+    """Fill the page of a watched fleet from the state of its assets that `folder` holds.
+
+    `groups` are the records of the fleet's groups.
+    """
     standing = read_standing(folder)
     assets = standing["assets"]
     failures = standing["failures"]
-    decided = {name: asset for name, asset in assets.items() if asset["last"] is not None}
+    stepped_assets = {name: asset for name, asset in assets.items() if asset["last"] is not None}
     counts = watched_fleet_counts(standing)
     asset_count = counted(len(assets | failures), "asset")
     notices: list[Block] = []
     if failures:
         notices.append(Notice(f"{len(failures)} of {asset_count} are not watched."))
-    without_step = sorted(assets.keys() - decided.keys() - failures.keys())
+    without_step = sorted(assets.keys() - stepped_assets.keys() - failures.keys())
     if without_step:
         names = ", ".join(without_step[:most_assets])
         more = ", ..." if len(without_step) > most_assets else ""
@@ -280,7 +283,7 @@ def _watched_fleet_page(
         notices.append(Notice(f"Without a step yet: {count} ({names}{more})."))
     group_sections = []
     for record in groups:
-        states = states_of_watched_assets(record, decided)
+        states = states_of_watched_assets(record, stepped_assets)
         urgent = states.of_assets(states.attention_order[:most_assets])
         attention = _attention(urgent, len(states.names), has_alarms=bool(states.alarms.any()))
         name = record["name"]
@@ -289,7 +292,7 @@ def _watched_fleet_page(
     picture, sections = _first_map(group_sections)
     return replace(
         page,
-        sentence=f"{len(decided)} of {asset_count} have taken a step.",
+        sentence=f"{len(stepped_assets)} of {asset_count} have taken a step.",
         picture=picture,
         outcome=[Highlights([(str(count), title) for title, count in counts.items()]), *notices],
         sections=[
@@ -338,9 +341,10 @@ def _map(
 
 
 def _attention(urgent: AssetStates, asset_count: int, *, has_alarms: bool) -> Table | str:
-    """Return the table of the assets that need attention first, of a number of known assets.
+    """Return the table of the assets that need attention first.
 
-    If no asset needs attention, the result is a sentence that says so.
+    If none needs attention, the result is a sentence that says so. `asset_count` is the number of
+    assets of which the most urgent ones were chosen.
     """
     if not urgent.names:
         return ""
