@@ -119,7 +119,7 @@ def show(blocks: "Iterable[str | TextTable]") -> None:
 def print_table(
     headings: Sequence[str], rows: Iterable[Sequence[str]], colours: Iterable[str] = ()
 ) -> None:
-    """Print a table of the result, unless `--quiet`.
+    """Print a table of results, unless `--quiet` was given.
 
     Parameters
     ----------
@@ -128,7 +128,7 @@ def print_table(
     rows : iterable of sequence of str
         The cells of each row.
     colours : iterable of str
-        The style of each row, where rows have one.
+        The style of each row; rows beyond the last style have none.
     """
     output = console()
     table = console_table(headings, rows, output.width)
@@ -208,14 +208,15 @@ def _column_widths(
 ) -> list[int] | None:
     """Return widths of columns with which no value breaks; None if the terminal is too narrow.
 
-    Each column begins as wide as its longest line. While the columns do not fit into the terminal,
-    one is made narrower by one character: the first, which holds the names of the rows, as long as
-    it is above its least width, then the widest of those that are above theirs.
+    Each column begins as wide as its longest line. As long as the columns do not fit into the
+    terminal, one of them is made narrower by one character: the first column, which holds the names
+    of the rows, until it has its least width, and then the widest that is above its least width.
 
     The least width of a column is that of its longest piece that must stay on one line (see
-    `_UNBROKEN`). In a terminal of at least `NARROWEST` columns the first column also keeps
+    `_UNBROKEN`). In a terminal of at least `NARROWEST` columns, the least width of the first column
+    is at least
 
-    - the width of its longest name, if that is at most half of the terminal;
+    - that of its longest name, if this is at most half of the terminal;
     - two fifths of the terminal otherwise.
     """
     widths = []
@@ -244,10 +245,10 @@ def _column_widths(
 def _folded(
     headings: Sequence[str], rows: Sequence[Sequence[str]], width: int
 ) -> tuple[list[str], list[list[str]], list[int]]:
-    """Return headings, rows and column widths of a table whose columns are folded into two.
+    """Fold a table into two columns; return its headings, rows and column widths.
 
-    The second column has the values of all further columns, each with its heading. A line of it is
-    filled with values until the next one would no longer fit.
+    The second column has the values of all columns but the first, each with its heading, one after
+    the other in lines that fit into the terminal.
     """
     name_width = min(width // 3, _longest([headings[0], *(row[0] for row in rows)]))
     room = width - 2 * _GAP - name_width

@@ -222,7 +222,7 @@ def _heading(standing: Standing) -> str:
 
 
 def _table_of_worst_assets(standing: Standing) -> "Table":
-    """Return the table of the assets with the most alarms and the most severe damage."""
+    """Return the table of watched assets, those with most alarms and most severe damage first."""
     from twin_master.mission.decision_record import health_in_words
 
     assets = {}
@@ -403,7 +403,7 @@ def fly_and_print_fleet(
 
 
 def _print_endings(outcome: "FleetOutcome") -> None:
-    """Print the number of twins, and why flights failed or ended early."""
+    """Print how many twins have flown, and why some flights failed or ended early."""
     flown_text = f"{counted(outcome.twins, 'twin')} in {outcome.seconds:.3g} s"
     if outcome.shards_kept:
         flown_text += f", {counted(outcome.shards_kept, 'shard')} there before"
@@ -465,8 +465,8 @@ def view_beside(
     Yields
     ------
     callable
-        Show the mission in a folder; to be called once the folder exists. Without `is_wanted` the
-        function does nothing.
+        Shows the mission in a folder; it must be called once the folder exists. Without `is_wanted`
+        it does nothing.
     """
     if not is_wanted:
         yield lambda _folder: None

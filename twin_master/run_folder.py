@@ -255,7 +255,7 @@ def _check_plug_ins(folder: Path, recorded: JsonObject) -> None:
 
 
 def record_inputs(folder: Path, config: JsonObject, hashes: Mapping[str, str]) -> JsonObject:
-    """Write the hashes of all input files into the configuration, or compare them with those there.
+    """Record the hashes of all input files in the configuration, or compare them with the recorded.
 
     Parameters
     ----------

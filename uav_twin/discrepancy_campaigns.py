@@ -169,10 +169,10 @@ def shell_arguments(campaign: Path, model: str | None) -> str:
 
 
 def _patch_of_hidden_effect(text: str, model: "Model", campaign: "Campaign") -> "ModelPatch":
-    """Return the patch of an effect that is hidden in an example.
+    """Return the patch of the effect that an option hides in an example.
 
-    The option is ID[@PLACE][:NAME=VALUE,...] or ID[@PLACE]=VALUE,... Parameters without a value
-    have that of `_usual_values`; without a place the effect acts at its first one. A
+    The option is ID[@PLACE][:NAME=VALUE,...] or ID[@PLACE]=VALUE,... Without a place, the effect
+    acts at the first place it has; parameters without a value have that of `_usual_values`. A
     `CatalogueError` is raised if there is no such effect, place or parameter.
     """
     from discrepancy.catalogue.entry import Setting
@@ -218,10 +218,10 @@ def _usual_values(effect: "Effect") -> dict[str, float]:
 def _parameter_values(
     text: str, identifier: str, numbers: list[str], names: list[str]
 ) -> dict[str, float]:
-    """Return the values of an effect's parameters by name.
+    """Read the values of an effect's parameters from the option `text`; return them by name.
 
-    `numbers` are "VALUE" in the order of the names, or "NAME=VALUE". A `CatalogueError` is raised
-    if there are too many, a name is unknown, or a value is not a finite number.
+    Each of `numbers` is "VALUE", in the order of `names`, or "NAME=VALUE". A `CatalogueError` is
+    raised if there are too many, if a name is unknown, or if a value is not a finite number.
     """
     if len(numbers) > len(names):
         raise CatalogueError(

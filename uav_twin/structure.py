@@ -216,9 +216,9 @@ def field(
 
 
 def _values_at(texts: Sequence[str], ranges: Mapping[str, tuple[float, float]]) -> dict[str, float]:
-    """Return the values that options `--at NAME=VALUE` set, by name.
+    """Read the options `--at NAME=VALUE`; return the values by name.
 
-    An error is raised unless each name occurs once and each value lies in its range.
+    An error is raised unless each name is known and occurs once, and each value lies in its range.
     """
     values: dict[str, float] = {}
     for text in texts:

@@ -117,15 +117,15 @@ def _structure_parts(structure: Structure) -> Iterator[StructurePart]:
     design = structure.design
     mesh = structure.mesh
     for number, material in enumerate(design.material):
-        count = int((structure.material_of == number).sum())
+        member_count = int((structure.material_of == number).sum())
         note = f"scaled by {material.scaled_by}" if material.scaled_by else ""
         sets = ", ".join(material.sets)
-        yield StructurePart("material", material.name, sets, count, "elements", note)
+        yield StructurePart("material", material.name, sets, member_count, "elements", note)
     for number, damage in enumerate(design.damage):
-        count = int((structure.region_of == number).sum())
-        yield StructurePart("damage region", damage.name, damage.set, count, "elements")
+        member_count = int((structure.region_of == number).sum())
+        yield StructurePart("damage region", damage.name, damage.set, member_count, "elements")
     for number, support in enumerate(design.support, start=1):
-        count = len(mesh.nodes_of(support.set, f"support[{number}]"))
+        member_count = len(mesh.nodes_of(support.set, f"support[{number}]"))
         notes = []
         if support.rigid_about is not None:
             notes.append("rigid")
@@ -133,17 +133,19 @@ def _structure_parts(structure: Structure) -> Iterator[StructurePart]:
             notes.append(f"holds {', '.join(support.hold)}")
         if support.springs:
             notes.append("springs")
-        yield StructurePart("support", str(number), support.set, count, "nodes", ", ".join(notes))
+        yield StructurePart(
+            "support", str(number), support.set, member_count, "nodes", ", ".join(notes)
+        )
     for load in design.load:
         if load.set is not None:
             nodes = mesh.nodes_of(load.set, load.name)
             faces = len(mesh.faces_between(load.set, nodes))
-            count, counted = (faces, "faces") if faces else (len(nodes), "nodes")
-            yield StructurePart("load", load.name, load.set, count, counted)
+            member_count, counted = (faces, "faces") if faces else (len(nodes), "nodes")
+            yield StructurePart("load", load.name, load.set, member_count, counted)
     for port in design.port:
         if port.set is not None:
-            count = len(mesh.nodes_of(port.set, port.name))
-            yield StructurePart("port", port.name, port.set, count, "nodes")
+            member_count = len(mesh.nodes_of(port.set, port.name))
+            yield StructurePart("port", port.name, port.set, member_count, "nodes")
     for gauge, distance in zip(design.gauge, structure.gauges_moved.tolist(), strict=True):
         note = ""
         if distance > 1e-6 * mesh.size:  # more than rounding

@@ -114,7 +114,10 @@ class _Samples(NamedTuple):
 
 
 def _decimated(record: RingDownRecord) -> _Samples:
-    """Return the samples of a record at about `WORKING_RATE`; decimation loses the extremes."""
+    """Reduce the sampling rate of a record to about `WORKING_RATE`.
+
+    Decimated samples have no lowest and highest values of their interval any more.
+    """
     factor = int(record.sampling_rate / WORKING_RATE + 0.5)
     if factor <= 1:
         return _Samples(record.time, record.signal, record.lowest, record.highest)
@@ -167,9 +170,9 @@ def spectral_peaks(record: RingDownRecord) -> tuple[float, float]:
     Raises
     ------
     ExperimentDataError
-        If the record is sampled too slowly, or fewer than two peaks rise by 3.5 times the median
-        noise and by 2 % of the highest amplitude (less, down to 0.3 %, if the record has died away
-        at its end), in the record itself or in its beginning.
+        If the record is sampled too slowly, or if it has fewer than two peaks, even after a factor
+        that emphasises its beginning. A peak must rise by 3.5 times the median noise, and by 2 % of
+        the highest amplitude, or less (down to 0.3 %) if the record has died away at its end.
     """
     highest = 0.5 * record.sampling_rate
     if highest < 4.0 * SEARCH_BAND[0]:
@@ -195,9 +198,9 @@ def spectral_peaks(record: RingDownRecord) -> tuple[float, float]:
 def _prominent_peaks(record: RingDownRecord, decay: float) -> list[float]:
     """Return the frequencies of significant peaks [Hz], the most prominent first.
 
-    The record is multiplied by exp(-decay t). A second mode that has died away after a tenth of the
-    record is lost in the noise of the rest and in the skirts of the first; the factor reduces both
-    and moves no frequency.
+    The record is multiplied by exp(-decay t). Without this factor, a second mode that dies away
+    after a tenth of the record would be lost in the noise of the remaining record, and in the
+    spectrum of the first mode beside its peak. The factor shifts no frequency.
     """
     time_from_start = record.time - record.time[0]
     decay_factor = np.exp(-decay * time_from_start)
@@ -326,6 +329,8 @@ class Averaged(NamedTuple):
 def average(trials: Fits, name: ModalQuantity, mode: int) -> Averaged:
     """Return the mean of a modal quantity over trials, with its scatter and standard error.
 
+    A single trial has no scatter (NaN), and the standard error of its fit.
+
     Parameters
     ----------
     name : {"frequency", "damping_ratio"}
@@ -375,9 +380,9 @@ _VISIBLE_AMPLITUDE = 4.0  # of the first mode in a window, over the residuals
 def amplitude_dependence(fit: RingDownFit) -> tuple[RingDownMode, ...]:
     """Fit the first mode in windows that slide over the record.
 
-    A linear wing has the same frequency and damping ratio in each. Amplitudes are those in the
-    middle of the windows. Windows in which the mode does not exceed four times the residuals are
-    left out.
+    A linear wing has the same frequency and damping ratio in each window, and so at each amplitude.
+    Amplitudes are those in the middle of the windows. Windows in which the mode does not exceed
+    `_VISIBLE_AMPLITUDE` times the residuals are left out.
     """
     record = fit.record
     first_start = record.time[0] + FIRST

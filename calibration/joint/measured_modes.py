@@ -33,7 +33,7 @@ _VISIBLE = 1.0  # amplitude of the second mode at the later start, over the resi
 def modal_readings(
     values: Sequence[float], deviations: Sequence[float]
 ) -> tuple[QuantityReading, ...]:
-    """Return the readings of two modes.
+    """Return frequencies and damping ratios of two modes as readings with standard deviations.
 
     Parameters
     ----------
@@ -73,20 +73,21 @@ class _SystematicTerms(NamedTuple):
 def measured_modes(trials: Fits) -> tuple[QuantityReading, ...]:
     """Return mean frequencies and damping ratios of fitted trials, with their uncertainty.
 
-    *Statistical*: the standard error of the mean over the trials, from the least-squares fits;
-    where the trials scatter more than these explain (chi-square at 5 %), from their scatter,
-    widened as Student's t.
+    The statistical part is the standard error of the mean over the trials. It follows from the
+    least-squares fits, or, if the trials scatter more than these explain (chi-square at 5 %), from
+    their scatter, widened as Student's t.
 
-    *Systematic*, added in quadrature. Each term counts only where it exceeds twice its own standard
+    Systematic terms are added in quadrature. Each counts only if it exceeds twice its own standard
     error, so that a linear wing gets none by chance:
 
-    - the first mode over the amplitude: frequency and damping ratio of sliding windows are fitted
-      by a line over the logarithm of the amplitude; the term is the slope times the standard
-      deviation of that logarithm. A real wing softens with the amplitude, and no single amplitude
-      is the right one for the linear model;
-    - the second mode over the choice of the fit: both modes are fitted again with free frequencies,
-      from the start of the cropped record (only if the frequencies had been taken from the
-      spectrum) and from 40 and 80 ms later; the term is the root mean square of the differences.
+    - The first mode depends on the amplitude: a real wing softens, and no single amplitude is the
+      right one for a linear model. Frequency and damping ratio in sliding windows are fitted by a
+      line over the logarithm of the amplitude; the term is the slope times the standard deviation
+      of this logarithm.
+    - The second mode depends on the choice of the fit. Both modes are fitted again with free
+      frequencies, from 40 and 80 ms later on and, if the frequencies had been taken from the
+      spectrum, also from the start of the cropped record; the term is the root mean square of the
+      differences.
 
     Raises
     ------
@@ -99,15 +100,15 @@ def measured_modes(trials: Fits) -> tuple[QuantityReading, ...]:
     frequency_2 = _mean_frequency(second_modes)
     ratio_1 = _mean_damping_ratio(first_modes)
     ratio_2 = _mean_damping_ratio(second_modes)
-    by_amplitude = _terms_of_amplitude(trials)
-    by_fit = _terms_of_fit(trials, frequency_2.mean, ratio_2.mean)
+    terms_of_amplitude = _terms_of_amplitude(trials)
+    terms_of_fit = _terms_of_fit(trials, frequency_2.mean, ratio_2.mean)
     return modal_readings(
         [frequency_1.mean, frequency_2.mean, ratio_1.mean, ratio_2.mean],
         [
-            math.hypot(frequency_1.standard_error, by_amplitude.frequency),
-            math.hypot(frequency_2.standard_error, by_fit.frequency),
-            math.hypot(ratio_1.standard_error, by_amplitude.damping_ratio),
-            math.hypot(ratio_2.standard_error, by_fit.damping_ratio),
+            math.hypot(frequency_1.standard_error, terms_of_amplitude.frequency),
+            math.hypot(frequency_2.standard_error, terms_of_fit.frequency),
+            math.hypot(ratio_1.standard_error, terms_of_amplitude.damping_ratio),
+            math.hypot(ratio_2.standard_error, terms_of_fit.damping_ratio),
         ],
     )
 

@@ -89,13 +89,13 @@ def wing_priors(
     The stiffness is given by e, a factor on Young's modulus of the skin. Its prior is that of the
     paper, N(1, (0.05 / 1.96)^2). The other priors are weak:
 
-    - Two servos and a pitot tube were weighed together. The mean of each mass is a third of their
-      total mass. The standard deviation is 50 g for a servo and 100 g for the pitot tube. Given the
-      total, the standard deviation of a servo's mass is then 30 g.
+    - Two servos and a pitot tube were weighed together. The mean of each of the three masses is a
+      third of the total. The standard deviation is 50 g for a servo and 100 g for the pitot tube;
+      given the total, that of a servo is 30 g.
     - The Rayleigh damping coefficients alpha and beta are not negative. Their priors are the
       halves above zero of Gaussians with mean zero and standard deviations 3 1/s and 1.5e-3 s. A
       coefficient of one standard deviation alone gives a damping ratio of 4 % (alpha, mode 1) or
-      14 % (beta, mode 2), twice the measured ratio.
+      14 % (beta, mode 2), which is twice the measured ratio.
 
     Parameters
     ----------
@@ -317,10 +317,10 @@ def tabulate_wing(model: ReducedModel, tolerance: float = TOLERANCE) -> WingTabl
 
 
 def _model_frequencies(model: ReducedModel, limits: Float, unit_points: Float) -> Float:
-    """Return the frequencies (N, 2) [Hz] of a model's flapwise modes in N states.
+    """Compute the frequencies (N, 2) [Hz] of a model's flapwise modes in N states.
 
-    The states are values of e, servo mass and pitot mass (N, 3), each scaled from its range to [-1,
-    1].
+    `unit_points` (N, 3) are values of e, servo mass and pitot mass, each scaled from its range in
+    `limits` (3, 2) to [-1, 1].
     """
     centre = limits.mean(axis=1)
     lower, upper = limits.T

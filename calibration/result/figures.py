@@ -41,7 +41,7 @@ def unmeasured_parameters(result: Calibration) -> tuple[list[int], list[str]]:
 
 @style.publication_style()
 def corner_figure(titles: Sequence[str], sets: Sequence[tuple[str, Float]]) -> Figure:
-    """Draw a corner plot: a panel of samples for each pair of parameters, and correlations.
+    """Draw a corner plot: histograms, scatter plots of pairs of parameters, and correlations.
 
     Parameters
     ----------
@@ -54,13 +54,22 @@ def corner_figure(titles: Sequence[str], sets: Sequence[tuple[str, Float]]) -> F
     """
     samples = [values for _, values in sets]
     correlation: Float = np.atleast_2d(np.corrcoef(samples[0], rowvar=False))
-    size = len(titles)
-    height = min(6.6, 1.1 + 1.1 * size)
-    bottom = height * (0.075 if size > 3 else 0.16)
+    parameter_count = len(titles)
+    height = min(6.6, 1.1 + 1.1 * parameter_count)
+    bottom = height * (0.075 if parameter_count > 3 else 0.16)
     figure, grid = style.panels(
-        size, size, height, 0.015 * height, bottom, left=0.105, wspace=0.10, hspace=0.10
+        parameter_count,
+        parameter_count,
+        height,
+        0.015 * height,
+        bottom,
+        left=0.105,
+        wspace=0.10,
+        hspace=0.10,
     )
-    limits = [_limits([values[:, column] for values in samples]) for column in range(size)]
+    limits = [
+        _limits([values[:, column] for values in samples]) for column in range(parameter_count)
+    ]
     for (row, column), axes in np.ndenumerate(np.array(grid)):
         if column > row:
             _write_correlation(axes, float(correlation[row, column]))

@@ -60,7 +60,7 @@ def save_calibration(calibration: Calibration, path: Path | str) -> Path:
 
 
 def result_bytes(calibration: Calibration) -> bytes:
-    """Return the content of the file of a calibration."""
+    """Return a calibration as the bytes of its NetCDF file, with a hash of its content."""
     groups = {
         "prior": _samples(calibration, calibration.prior_samples, "prior sample"),
         "posterior": _samples(calibration, calibration.samples, "posterior sample"),
@@ -211,7 +211,7 @@ def _json(content: object) -> str:
 
 
 def _content_hash(groups: Groups, root: Root) -> str:
-    """Return a SHA-256 of all values and attributes, by which damage is detected."""
+    """Return a SHA-256 of all values and attributes of a calibration file, to detect damage."""
     digest = hashlib.sha256()
     for name in sorted(set(root) - {_HASH}):
         digest.update(f"{name}\0{root[name]}\0".encode())

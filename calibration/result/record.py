@@ -354,10 +354,9 @@ class Calibration:
         return -float(np.mean(errors))
 
     def stratified_draws(self, name: str, count: int, seed: Seed) -> Float:
-        """Return draws (count,), one from each of `count` strata of equal probability, shuffled.
+        """Draw one value from each of `count` strata of equal probability; return them shuffled.
 
-        The means of functions of this quantity thus have a far smaller variance than those of
-        independent draws.
+        Means over these draws have a far smaller variance than means over independent draws.
 
         Raises
         ------

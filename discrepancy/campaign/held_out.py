@@ -114,7 +114,8 @@ def _choose_trials(
 def _order_of_candidates(trials: Sequence[Trial]) -> list[int]:
     """Return the indices of trials in the order in which they are considered for holding out.
 
-    Levels between the extremes come first, from the middle outwards; of equal ones, later trials.
+    Trials with load levels between the extremes come first, beginning with the level nearest to the
+    middle. Of trials with equal levels, the later one comes first.
     """
     levels = np.array([trial.level for trial in trials])
     lowest = levels.min()
@@ -132,7 +133,9 @@ def _order_of_candidates(trials: Sequence[Trial]) -> list[int]:
 def _stays_covered(
     candidate: Trial, other_trials: Sequence[Trial], of_other_kinds: Sequence[Trial]
 ) -> bool:
-    """Return whether the trials that remain cover a candidate: channels, run, load place and level.
+    """Return whether the remaining trials have the channels, run, place and level of a candidate.
+
+    Its level must lie between the lowest and the highest level of the remaining trials.
 
     Parameters
     ----------
@@ -158,7 +161,7 @@ def _stays_covered(
 
 
 def _split_by_levels(trial: Trial, names: Set[str]) -> tuple[Trial, Trial] | None:
-    """Split a trial into a fitted trial and a held-out trial of every third interior load level.
+    """Split a trial into a fitted and a held-out one, which has every third interior load level.
 
     Parameters
     ----------

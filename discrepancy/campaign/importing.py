@@ -139,7 +139,7 @@ class LaboratoryImport:
         return "To have the outputs of your model listed, give --model."
 
     def with_answer(self, option: str, subject: str, answer: str) -> "LaboratoryImport":
-        """Return a new import that takes one more answer of the user into account.
+        """Return the import with one more answer of the user.
 
         Parameters
         ----------
@@ -150,8 +150,8 @@ class LaboratoryImport:
         answer : str
             The answer that the user gave.
         """
-        of_option = {**self.answers.get(option, {}), subject: answer}
-        answers = {**self.answers, option: of_option}
+        answers_to_option = {**self.answers.get(option, {}), subject: answer}
+        answers = {**self.answers, option: answers_to_option}
         return LaboratoryImport(self._sheets_as_read, answers, self._quantity_of, self._outputs)
 
     # ---------------------------------------------------------------- files
@@ -217,10 +217,10 @@ class LaboratoryImport:
         return sampling_interval(answer) if answer else None
 
     def _begin_of_trial(self, file: str) -> str | None:
-        """Return how a forced or driven trial begins; None if the user did not state it.
+        """Return how a forced or driven trial begins, as the user stated it, or None.
 
-        The default is then noted as assumed. Raises `CampaignFileError` if the user states it for
-        another kind of trial.
+        If the user did not state it, the default is noted as an assumption. Raises
+        `CampaignFileError` if the user states it for another kind of trial.
         """
         kind = self.kinds[file]
         if kind not in (TrialKind.FORCED, TrialKind.DRIVEN):
@@ -240,10 +240,10 @@ class LaboratoryImport:
         return None if self._questionnaire.is_assumed("begins", file) else answer
 
     def _is_held_out(self, file: str) -> bool:
-        """Return whether a trial is kept for proof and not fitted; no by default.
+        """Return whether a trial is held out for the proof and not fitted; no by default.
 
-        A campaign of one trial is not asked. Raises `CampaignFileError` if the user states it for
-        samples at rest.
+        The user is not asked if there is only one trial. Raises `CampaignFileError` if the user
+        answers for a noise record or, without being asked, for a single trial.
         """
         trials = [name for name, kind in self.kinds.items() if kind != NOISE]
         is_noise = self.kinds[file] == NOISE
@@ -417,10 +417,10 @@ class LaboratoryImport:
         return self.releases.get(file, {}).get("force")
 
     def merge_clocks_of(self, sheet: Sheet) -> MergedTable | None:
-        """Return a table with several columns of times on one clock; it is computed once.
+        """Merge a table with several columns of times into one with a single clock.
 
-        The result is None if the table has fewer than two columns of times, or if questions are
-        open.
+        The result is None if the table has fewer than two columns of times, or if questions to the
+        user are open. It is computed once.
 
         Raises
         ------
@@ -428,8 +428,8 @@ class LaboratoryImport:
             For the causes of `find_clocks` and `merge_clocks`.
         """
         columns = [column for column in self.columns if column.sheet is sheet]
-        number_of_times = [column.role for column in columns].count("time")
-        if self.questions or number_of_times < 2:
+        time_column_count = [column.role for column in columns].count("time")
+        if self.questions or time_column_count < 2:
             return None
         if sheet.name not in self._clocks:
             self._clocks[sheet.name] = merge_clocks(
@@ -451,9 +451,9 @@ class LaboratoryImport:
         return sentences
 
     def _text_table(self, sheet: Sheet) -> TextTable:
-        """Return the table of a file in SI, with one column of times.
+        """Return the table of a file in SI, with one column of times if it is recorded in time.
 
-        A ring-down from a force has the column `force`, too.
+        The table of a ring-down from a force also has a column `force`.
 
         Raises
         ------

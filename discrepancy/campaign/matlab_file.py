@@ -43,10 +43,10 @@ class MatlabTable(NamedTuple):
 def read_matlab(path: Path) -> MatlabTable:
     """Read the table in a MATLAB file of version 4 to 7.3.
 
-    Its columns are the vectors, the columns of matrices with at most 32 columns, and the same in
-    the fields of structs. All have one length, which is that with the most numbers in total, or
-    several if each length has a column of times. Variables that do not fit are left out, and the
-    remark names them.
+    Its columns are vectors and the columns of matrices with at most 32 columns, also in the fields
+    of structs. Usually they have one length: that whose columns hold most numbers in total. If
+    columns of times have several lengths, the columns of these lengths belong to the table, too.
+    Variables that do not fit are left out, and the remark names them.
 
     Raises
     ------
@@ -157,10 +157,11 @@ def _hdf5_array(stored_object: h5py.Dataset | h5py.Group) -> np.ndarray | None:
 
 
 def _columns_of_variable(name: str, value: object) -> dict[str, np.ndarray]:
-    """Return the columns (N,) of a variable by name; none unless it is a vector or narrow matrix.
+    """Return the columns (N,) of a variable, which is a vector or a matrix, by name.
 
-    The longer side of a matrix NAME holds the samples, and its columns are called NAME 1, NAME 2
-    and so on. Texts, complex numbers, scalars and matrices wider than `_MOST_COLUMNS` give none.
+    The samples lie along the longer side of a matrix NAME, whose columns are called NAME 1, NAME 2
+    and so on. Texts, complex numbers, scalars and matrices wider than `_MOST_COLUMNS` give no
+    column.
     """
     if isinstance(value, MatlabOpaque | MatlabFunction) or not isinstance(value, np.ndarray):
         return {}

@@ -317,13 +317,13 @@ def strongest_line_near(
 def find_line(series: FloatArray) -> LineTest:
     """Test a noise record for a spectral line that stands out of the spectrum of its noise.
 
-    Slow noise has most of its power at low frequencies, where a test against white noise takes it
-    for a line. So the ordinates of the periodogram are divided by the spectrum of an autoregression
-    before they are tested by Fisher's g. An autoregression of a record with a line would follow the
-    line, so that it is fitted to the record minus the line. Two lines are tried: the strongest one,
-    and the one that exceeds the spectrum of an autoregression of the whole record most. The p-value
-    allows for the choice (Bonferroni). Fewer than `LEAST_LINE_PERIODS` periods are a drift and no
-    line.
+    Slow noise has most of its power at low frequencies, where a test against white noise would take
+    it for a line. Therefore the ordinates of the periodogram are divided by the spectrum of an
+    autoregression before they are tested by Fisher's g. The autoregression is fitted to the record
+    minus the line, because otherwise it would follow the line. Two candidates are tried: the
+    strongest line, and the one that most exceeds the spectrum of an autoregression of the whole
+    record. The p-value allows for this choice (Bonferroni). A sine of fewer than
+    `LEAST_LINE_PERIODS` periods counts as a drift and not as a line.
 
     Parameters
     ----------

@@ -161,7 +161,7 @@ def assemble_campaign(
 
 
 def complete_events(events: Iterable[Event], trials: tuple[Trial, ...], source: str) -> list[Event]:
-    """Return the events with the names of all their trials, after checking them.
+    """Check the events of a file, and return them with the names of all their trials.
 
     Parameters
     ----------
@@ -274,10 +274,10 @@ def _read_table(folder: Path, name: str) -> TextTable:
 def _without_fill_values(
     table: TextTable, section: schema.CampaignSection
 ) -> tuple[TextTable, list[str]]:
-    """Return a table with empty cells for the fill values of channels, and a clause on each.
+    """Replace the fill values of channels, such as -999, by empty cells.
 
-    Columns that nothing reads stay as they are. Raises `CampaignDataError` if a load or another
-    input has a fill value.
+    Returns the table, and a clause for each column with fill values. Columns that are not read stay
+    as they are. Raises `CampaignDataError` if a load or another input has a fill value.
     """
     channel_columns = {channel.table_column for channel in section.channel}
     load_columns = {recorded_input.table_column for recorded_input in section.input}
@@ -308,10 +308,10 @@ def _read_channels(
     trials: tuple[Trial, ...],
     remarks: list[str],
 ) -> dict[str, Channel]:
-    """Return the channels by name, with their noise records.
+    """Return the channels by name, each with its noise record if there is one.
 
-    The noise of a channel comes from its samples at rest, else from the key `noise` of the channel,
-    else from repeated trials, with a remark.
+    The noise of a channel comes from its samples at rest, or else from the key `noise` of the
+    channel, or else from repeated trials, which gives a remark.
 
     Parameters
     ----------
@@ -413,10 +413,10 @@ _ASSUMED = ' (assumed; set `begins` to "settled", "still" or "unknown")'
 
 
 def _remarks_on_begins(trials: tuple[Trial, ...]) -> list[str]:
-    """Return a remark on each state in which trials begin, stated by the file or assumed.
+    """Return remarks that say which trials begin in which state, stated by the file or assumed.
 
-    An assumed state of a forced trial without a force at its first sample makes no difference and
-    gets no remark.
+    A forced trial without a force at its first sample begins in the same way in any assumed state,
+    and is not mentioned.
     """
     groups: dict[tuple[Start, bool], list[str]] = {}
     for trial in trials:

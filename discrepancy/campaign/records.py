@@ -186,7 +186,7 @@ class Trial(TrialKeys):
         return cls(name=name, kind=kind, channels=channels, time=time, **{**defaults, **fields})
 
     def rows(self, rows: BoolArray | IntArray | slice, **changes: Any) -> "Trial":
-        """Return the trial with some of its rows, and with other fields changed.
+        """Return a copy of the trial with some of its rows only, and with other fields changed.
 
         Parameters
         ----------
@@ -385,10 +385,9 @@ class Campaign:
     def largest_magnitudes(self) -> dict[str, float]:
         """The largest loads and times of the campaign, which scale the parameters of effects.
 
-        ``force`` is the largest force [N], ``load_factor`` the largest load factor [1],
-        ``duration`` the longest record of a dynamic trial [s], ``campaign_time`` the time from the
-        first sample to the last [s]. Without a dynamic trial ``duration`` is 1 s; if all samples
-        have the same time, ``campaign_time`` is 1 s. Loads that do not occur are 0.
+        ``force`` is the largest force [N], and ``load_factor`` the largest load factor [1]; 0 if
+        they do not occur. ``duration`` is the longest record of a dynamic trial, or 1 s without
+        one. ``campaign_time`` is the time from the first sample to the last, or 1 s if it is zero.
         """
         force = load_factor = 0.0
         durations: list[float] = []

@@ -40,7 +40,7 @@ def check_sampling(time: FloatArray, cells: Sequence[str], user: str, file: str)
     cells : sequence of str
         The same times as printed in the file.
     user, file : str
-        The name of the trial or record that the times belong to, and name of the file, for
+        The name of the trial or record that the times belong to, and that of the file, for
         messages.
 
     Returns
@@ -60,9 +60,9 @@ def check_sampling(time: FloatArray, cells: Sequence[str], user: str, file: str)
             f"{LEAST_SAMPLES}."
         )
     steps = np.diff(time)
-    least = int(np.argmin(steps))
-    if steps[least] <= 0.0:
-        raise CampaignDataError(decreasing_times_message(file, user, cells, least))
+    shortest = int(np.argmin(steps))
+    if steps[shortest] <= 0.0:
+        raise CampaignDataError(decreasing_times_message(file, user, cells, shortest))
     return undo_rounding(time, cells)
 
 
@@ -86,13 +86,13 @@ def decreasing_times_message(file: str, user: str, cells: Sequence[str], index: 
 
 
 def undo_rounding(time: FloatArray, cells: Sequence[str]) -> FloatArray:
-    """Undo the rounding of printed times: return an even grid if rounding explains the departures.
+    """Undo the rounding of printed times: return an evenly spaced grid if rounding explains them.
 
-    Times that were printed with few decimals are not evenly spaced even if the samples were. Such
-    times are replaced by the evenly spaced grid of least squares if they depart from an even grid
-    by at most one unit of the last printed decimal, plus `EVENNESS_TOLERANCE` intervals. The grid
-    passes through zero if the first time is zero. Times that are even to 1e-9 of the interval, and
-    times that rounding does not explain, are returned as they are.
+    Times that were printed with few decimals are not evenly spaced even if the samples were. If
+    their intervals differ by at most one unit of the last printed decimal plus `EVENNESS_TOLERANCE`
+    intervals, the times are replaced by the even grid of least squares, which passes through zero
+    if the first time is zero. Times that are even to 1e-9 of the interval already, and times that
+    rounding does not explain, are returned as they are.
 
     Parameters
     ----------
@@ -167,13 +167,13 @@ def quantum_of(values: FloatArray) -> float:
 
 
 def lattice_step(values: FloatArray) -> float | None:
-    """Return the step between the output levels of a quantised sensor, if its readings show them.
+    """Return the step between the output levels of a quantised sensor, if its readings show it.
 
-    The levels are the values that two neighbouring readings share; they must be evenly spaced (a
+    A level is a value that two consecutive readings share; levels must be evenly spaced (a
     lattice). For example, the readings of an encoder of 4096 steps, printed with six decimals,
-    differ by 0.001534 or 0.001533: the quantum is this step, and not the difference of the two. If
-    such readings are resampled by linear interpolation, values between the levels occur too, but
-    they do not repeat.
+    differ by 0.001534 or 0.001533: the step is this difference, and not 0.000001, by which the two
+    differ. If readings were resampled by linear interpolation, values between the levels occur too,
+    but consecutive readings rarely share them.
 
     Parameters
     ----------
@@ -203,12 +203,12 @@ def lattice_step(values: FloatArray) -> float | None:
 
 
 def least_beyond_rounding(differences: FloatArray) -> float:
-    """Return the smallest positive difference that the rounding of printed decimals does not cause.
+    """Return the smallest positive difference of readings that is not caused by rounding in print.
 
-    Rounding causes many differences that are far smaller than the true ones. These small
-    differences end at the first gap in the sorted differences that exceeds the factor
-    `ROUNDING_GAP`, if at least `LEAST_ROUNDED` differences lie below this gap; otherwise no
-    difference counts as rounding.
+    Rounding causes many differences that are far smaller than the true ones. In the sorted
+    differences the two are separated by a gap: a difference that exceeds the previous one by the
+    factor `ROUNDING_GAP`, with at least `LEAST_ROUNDED` differences before it. The difference after
+    the first such gap is returned; without a gap, no difference counts as rounding.
 
     Parameters
     ----------

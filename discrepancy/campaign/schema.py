@@ -125,7 +125,7 @@ ChannelInFile = Annotated[
 
 
 def _input_in_si(recorded_input: records.RecordedInput) -> records.RecordedInput:
-    """Return an input of a file with the deviation of its offset in SI.
+    """Check an input of a file, and return it with the deviation of its offset in SI.
 
     A motion is smooth between its samples, unless it is a reference that a controller follows.
 
@@ -306,8 +306,8 @@ class CampaignSection(Section):
     def _column_checks(self) -> Iterator[Check]:
         """Yield the checks of inputs and channels: which columns they read, and in which units.
 
-        Inputs need a trial that uses them, no two of them read one column, a channel reads no
-        column in which trials have their loads, and all temperatures have one unit.
+        Inputs need a trial that uses them. No two inputs or channels may read the same column, and
+        a channel none in which trials have their loads. All temperatures must have one unit.
         """
         kinds_with_inputs = (records.TrialKind.DRIVEN, records.TrialKind.STATIC)
         no_trial_has_inputs = bool(self.input) and not self._has_trial_of(*kinds_with_inputs)
@@ -380,7 +380,7 @@ class CampaignSection(Section):
 
 
 def parse_campaign(table: JsonRecord, source: str) -> CampaignSection:
-    """Return the checked content of a campaign's TOML file.
+    """Check the content of a campaign's TOML file, and return it as a record.
 
     Parameters
     ----------

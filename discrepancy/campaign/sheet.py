@@ -139,7 +139,7 @@ class Sheet:
 
 
 def read_sheets(path: Path) -> list[Sheet]:
-    """Return the table of a file in a list; for `FILE.xlsx#all` a table for each of its sheets.
+    """Read all tables of a file: one, or for `FILE.xlsx#all` one for each sheet of the workbook.
 
     Sheets without a number, such as notes, are left out. The remark of the first table names them.
 
@@ -177,8 +177,9 @@ def read_sheet(path: Path) -> Sheet:
     Raises
     ------
     CampaignFileError
-        If the file cannot be read, holds no table with a head, has a row with a text for a number,
-        has decimals written in two ways, or a time that cannot be read or can be read in two ways.
+        If the file cannot be read or holds no table with a head; if a row has a text where a number
+        is expected, if decimals are written in two ways, or if a time cannot be read or can be read
+        in two ways.
     """
     file, sheet_name = _file_and_sheet(path)
     ending = _ending_by_content(file)
@@ -211,10 +212,11 @@ def _table_of_workbook(
 
 
 def _without_fill_values(sheet: Sheet, unit_of_place: str) -> Sheet:
-    """Return a table with its fill values replaced by empty cells; its remark names all of them.
+    """Replace the fill values of a table, such as -999, by empty cells.
 
-    The remark also names other wild readings, which stay. A table whose numbers can be read in two
-    ways is returned as it is.
+    The remark of the returned table names them, and also other wild readings, which stay. A table
+    whose numbers can be read in two ways is returned as it is. `unit_of_place` is the word for a
+    row in the remark, "line" or "row".
     """
     if sheet.decimal is None:
         return sheet
@@ -246,7 +248,7 @@ def _file_and_sheet(path: Path) -> tuple[Path, str]:
 
 
 def _ending_by_content(file: Path) -> str:
-    """Return the ending of a file's name; for a workbook the one that fits its content.
+    """Return the ending of a file's name, or for a workbook the ending that fits its content.
 
     Raises
     ------
@@ -497,10 +499,10 @@ def _matlab_sheet(path: Path) -> Sheet:
 
 
 def _text_rows(path: Path) -> tuple[Rows, str]:
-    """Return the rows of a text file, and the separator of cells that makes the best table.
+    """Return the rows of a text file, and the separator of its cells.
 
-    Tabs, semicolons and commas are tried on the first `_LINES_FOR_SEPARATOR` lines; `table_quality`
-    decides.
+    Tabs, semicolons and commas are tried on the first `_LINES_FOR_SEPARATOR` lines; the separator
+    that gives the best table is taken.
     """
     lines = read_text(path, CampaignFileError, otherwise="latin-1").splitlines()
 

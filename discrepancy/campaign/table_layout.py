@@ -218,10 +218,10 @@ def _check_head_is_no_reading(
     places_of_values: Sequence[set[int]],
     place: str,
 ) -> None:
-    """Raise an error if readings with a text among them stand just above the table.
+    """Raise an error if rows just above the table are readings, of which some cells are texts.
 
-    Such readings would pass for the row of names. A row counts as such if it has a number in the
-    first core column and in at least half of the core columns.
+    Such a row would be taken for the row of names. A row counts as readings if it has a number in
+    the first core column and in at least half of the core columns.
     """
     first_reading = first_row
     for index in range(first_row - 1, -1, -1):

@@ -68,7 +68,7 @@ def read_workbook(path: Path) -> dict[str, WorkbookSheet]:
 
 
 def title_of_sheet(file: Path, stated_title: str, workbook: Mapping[str, WorkbookSheet]) -> str:
-    """Return the title of the sheet that a user names, or of the only one that is not empty.
+    """Return the title of the sheet to read: that which the user names, or the only filled one.
 
     Parameters
     ----------
@@ -162,15 +162,15 @@ def _is_format_of_times(number_format: str) -> bool:
 
 
 def _time_of_serial_number(days: float, number_format: str, epoch: datetime) -> str:
-    """Return the time that Excel stores as a number of days, to the microsecond.
+    """Return the text of a time that Excel stores as a number of days, to the microsecond.
 
-    A number below 366, or with a format of elapsed time, becomes hours, minutes and seconds, and
-    the hours may exceed 24. Any other becomes a date with a time, even if its format shows only one
-    of them. A negative number, or one beyond the calendar, stays a number.
+    A number below 366, or with a format of elapsed time, becomes hours, minutes and seconds, with
+    hours that may exceed 24. Any other number becomes a date with a time, even if its format shows
+    only one of them. A negative number, or one beyond the calendar, stays a number.
 
-    A float of days since 1900 is off by up to a microsecond. Samples at usual rates are taken at
-    multiples of 25 microseconds, so that a date within a microsecond of such a multiple is moved
-    to it.
+    A floating-point number of days since 1900 has an error of up to a microsecond. At usual
+    sampling rates, times are multiples of 25 microseconds; a date within a microsecond of such a
+    multiple is set to it.
     """
     from openpyxl.styles.numbers import is_timedelta_format
 

@@ -75,12 +75,12 @@ from reporting.formats.toml_file import read_toml, validate
 
 
 def effects_of_file(path: Path) -> tuple[Effect, ...]:
-    """Read the effects of a TOML file.
+    """Read the effects of a TOML file: those of its tables [[effect]], or the file as one effect.
 
     Raises
     ------
     CatalogueError
-        If the file cannot be read, or an effect in it is not valid; the message names the place.
+        If the file cannot be read, or an effect in it is not valid; the message says where.
     """
     content = read_toml(path, CatalogueError, what="file of effects")
     tables = content.get("effect", [content])
@@ -129,9 +129,10 @@ _REASON_OF_NAME = (
 
 
 def _check_names(section: EffectSection, names: frozenset[str], place: str) -> None:
-    """Raise an error if a parameter or event has a name that means something else in expressions.
+    """Raise an error if the name of a parameter or event has another meaning in expressions.
 
-    `names` are those of parameters and shape parameters.
+    `names` are those of parameters and shape parameters; `place` is the file and the number of the
+    effect, for messages.
     """
     used_names = {*SCALES, *RESERVED}
     for name in names:
@@ -147,9 +148,10 @@ def _check_names(section: EffectSection, names: frozenset[str], place: str) -> N
 
 
 def _check_places_and_needs(section: EffectSection, place: str) -> None:
-    """Raise an error for an unknown word for places or needs, or if there are no primitives.
+    """Raise an error for an unknown word in `places` or `needs`, or if there are no primitives.
 
-    A word of `PLACES` in a list, which is the name of a single place, is refused, too.
+    `places` is a word of `PLACES`, which stands for many places, or a list of names of places. A
+    word of `PLACES` in such a list is refused, since it would be taken as a name.
     """
     for need in section.needs:
         if need not in NEEDS:
@@ -177,10 +179,10 @@ def _check_places_and_needs(section: EffectSection, place: str) -> None:
 def _check_acts_on_dynamic_trials(
     section: EffectSection, templates: Sequence["_PrimitiveTemplate"]
 ) -> None:
-    """Raise an error if an effect depends on time, but is to act on static trials or flights.
+    """Raise an error if an effect depends on time, but is to act on trials that have no time.
 
-    The rows of these trials are not samples of a motion in time. A primitive depends on time if it
-    acts in windows or has a value that is a formula in time.
+    The rows of static trials and of flights are not samples of a motion in time. A primitive
+    depends on time if it acts in windows of time or has a value that is a formula in time.
     """
     time_dependent = [
         template
@@ -237,8 +239,8 @@ class _PrimitiveTemplate:
     def primitives(self, context: BuildContext) -> Iterator[Primitive]:
         """Yield the evaluated primitive, once for each occurrence of its events in dynamic trials.
 
-        Each then acts in a window of time of its trial. Without events and windows there is one
-        primitive. If the expression `if` is zero, there is none.
+        Each primitive then acts in a window of time of its trial. A template without events and
+        windows gives one primitive. If its expression `if` is zero, it gives none.
         """
         values_by_name = dict(context.values)
         for name in self.scales:
@@ -267,8 +269,8 @@ class _PrimitiveTemplate:
     def _evaluate_primitive(self, values_by_name: Mapping[str, float], target: Target) -> Primitive:
         """Return the primitive with its expressions evaluated.
 
-        A formula in time stays a formula, with numbers in the place of all other names. Texts that
-        stand for the place of the effect are replaced by the names of the target.
+        In a formula in time, all names but the time are replaced by numbers. Texts such as "place",
+        which stand for the place of the effect, are replaced by the names of the target.
         """
         texts_of_place = {
             "place": target.name,
@@ -276,20 +278,20 @@ class _PrimitiveTemplate:
             "motion of the place": target.motion,
         }
         formulas = PRIMITIVES[self.kind].formula_fields
-        row: dict[str, str | float] = {}
+        fields_of_primitive: dict[str, str | float] = {}
         for name, value in self.values.items():
             if isinstance(value, str):
-                row[name] = texts_of_place.get(value, value)
+                fields_of_primitive[name] = texts_of_place.get(value, value)
             elif not isinstance(value, Expression):
-                row[name] = value
+                fields_of_primitive[name] = value
             elif name in formulas:
                 used_numbers = {
                     key: values_by_name[key] for key in value.used_names() if key in values_by_name
                 }
-                row[name] = value.with_numbers(used_numbers)
+                fields_of_primitive[name] = value.with_numbers(used_numbers)
             else:
-                row[name] = value.value(values_by_name)
-        return _build_primitive(self.kind, row)
+                fields_of_primitive[name] = value.value(values_by_name)
+        return _build_primitive(self.kind, fields_of_primitive)
 
 
 def _parse_primitive(

@@ -125,9 +125,9 @@ def effect_by_identifier(identifier: str, effects: Iterable[Effect]) -> Effect:
 def variants_in_events(effects: Sequence[Effect], setting: Setting) -> tuple[Effect, ...]:
     """Return variants of effects that act only during an event, as further hypotheses.
 
-    Such a variant acts in all trials that have the event, also in held-out ones, from the start of
-    the event to its end. These times are known and not fitted. Effects that cannot act in a window
-    of time, or that the model cannot switch on and off, have no variant.
+    Such a variant acts from the start of the event to its end, which the campaign states, in all
+    trials that have the event, also in held-out ones. Effects that cannot be limited to a window of
+    time, or that the model cannot switch on and off, have no variant.
 
     Parameters
     ----------
@@ -161,7 +161,8 @@ def _can_act_in_windows(effect: Effect, setting: Setting) -> bool:
     """Return whether an effect can be limited to windows of time with this model.
 
     The effect must act in dynamic trials, have no windows of its own, and consist of primitives
-    that allow windows. The model must switch laws in time, unless the effect concerns sensors only.
+    that allow windows. The model must be able to switch laws in time, unless the effect concerns
+    sensors only.
     """
     places = effect.places(setting)
     if not places or not effect.acts_on & DYNAMIC:
@@ -178,7 +179,7 @@ def _can_act_in_windows(effect: Effect, setting: Setting) -> bool:
 
 
 def _variant_in_event(effect: Effect, event_name: str, setting: Setting) -> Effect:
-    """Return the variant of an effect that acts only during all events of a name."""
+    """Return the variant of an effect that acts only during the events of a given name."""
     windows: list[Window] = []
     for event in setting.campaign.events:
         if event.name == event_name:
@@ -199,11 +200,12 @@ def _variant_in_event(effect: Effect, event_name: str, setting: Setting) -> Effe
 
 
 def with_prior_weights(effects: Sequence[Effect]) -> tuple[Effect, ...]:
-    """Return the effects that are compared, with prior weights by their stated frequencies.
+    """Give effects with a stated frequency prior weights in proportion to their frequencies.
 
-    An effect without a frequency keeps its weight. The effects with a frequency have, in total, the
-    weight of the same number of effects without one. This total is divided among kinds by their
-    frequencies, and within a kind evenly among the effect and its variants in events.
+    An effect without a frequency keeps its weight. The effects with a frequency have, in total, as
+    much weight as the same number of effects of weight 1. This total is divided among kinds of
+    effects by their frequencies, and within a kind evenly among the effect and its variants in
+    events.
     """
     frequencies: dict[str, float] = {}  # by kind, as the counts
     variant_counts: Counter[str] = Counter()

@@ -54,8 +54,9 @@ class FmuSimulator(FmuAtRest):
     ) -> SampledOutputs:
         """Return outputs (N, C) and their rates in a dynamic trial.
 
-        The linear system of the FMU is solved if the FMU is linear and no force makes the speed of
-        a port jump. Otherwise the FMU itself is stepped, and splines lead to the samples.
+        If the FMU is linear and no force makes the speed of a port jump, its identified linear
+        system is solved. Otherwise the FMU itself is stepped, and its outputs are interpolated by
+        splines at the N times.
 
         Parameters
         ----------
@@ -68,13 +69,13 @@ class FmuSimulator(FmuAtRest):
         readout : Readout
             The C outputs, and the N times at which they are read.
         refinement : int
-            Steps are this many times smaller.
+            The factor by which all steps are smaller.
 
         Raises
         ------
         ModelError
-            If the FMU refuses an input, or if it has to be stepped and a port has no velocity
-            output, or the steps do not converge.
+            If the FMU refuses an input; or if it has to be stepped, but a port has no velocity
+            output or the steps do not converge.
         """
         times = readout.times
         end = max(float(times[-1]), float(trial.time[-1]))
@@ -196,9 +197,9 @@ class FmuSimulator(FmuAtRest):
     ) -> "StartState":
         """Return the state of the linear system at the start of a trial, and the laws' memory.
 
-        Under a recorded force the start is the equilibrium with the J laws under the first force.
-        Without laws or without a recorded force it is the released state, and the laws have no
-        memory.
+        Under a recorded force the trial starts in equilibrium with its first value and the forces
+        of the J laws. Without laws, or without a recorded force, it starts as released, and the
+        laws have no memory of earlier displacements.
         """
         if not len(laws) or excitation.force is None:
             return StartState(self._start_state(system, excitation, release_values), None)
@@ -272,10 +273,10 @@ class FmuSimulator(FmuAtRest):
         return SteppedOutputs(outputs, fixed_step or longest_step / parts)
 
     def _settled_with_laws(self, run: FmuRun, laws: PortLaws, trial: str) -> "SettledRun":
-        """Return a run that begins in equilibrium with laws under its first loads.
+        """Return a run that begins in equilibrium with the laws under its first loads.
 
         If no load acts, or no port of a law is displaced at the start, the run is returned as it
-        is, and the laws have no memory.
+        is, and the laws have no memory of earlier displacements.
         """
         outputs = self._outputs_at_begin(run)
         columns = [self.displacement_columns[self.ports.index(name)] for name in laws.ports]
@@ -285,9 +286,9 @@ class FmuSimulator(FmuAtRest):
         def run_under(forces: FloatArray) -> FmuRun:
             """Return the run whose first inputs are the loads minus forces of the laws (1, J)."""
             loads = {name: np.full(1, value) for name, value in run.initial_offsets.items()}
-            begin = self.subtract_law_forces(loads, laws, forces)
+            first_loads = self.subtract_law_forces(loads, laws, forces)
             return run._replace(
-                initial_offsets={name: float(values[0]) for name, values in begin.items()}
+                initial_offsets={name: float(values[0]) for name, values in first_loads.items()}
             )
 
         def outputs_under(forces: FloatArray) -> FloatArray:
@@ -305,10 +306,10 @@ class FmuSimulator(FmuAtRest):
         return outputs[None]
 
     def _outputs_with_laws(self, run: FmuRun, laws: PortLaws, trial: str) -> FloatArray:
-        """Return the outputs (K, C) at the K step boundaries of a run with laws at its ports.
+        """Step the FMU with laws at its ports; return the outputs (K, C) at K step boundaries.
 
-        All are NaN if the explicit coupling of FMU and laws is unstable. Raises `ModelError` if a
-        port of a law has no velocity output.
+        All outputs are NaN if the explicit coupling of FMU and laws is unstable. Raises
+        `ModelError` if a port of a law has no velocity output.
         """
         run, memory = self._settled_with_laws(run, laws, trial)
         ports = [self.ports.index(name) for name in dict.fromkeys(laws.ports)]
@@ -325,9 +326,9 @@ class FmuSimulator(FmuAtRest):
             )
         first_step, speed_gain = self._probe_port_speeds(run, inputs, speed_columns)
         coupling = PortCoupling(laws, names, speed_gain, run.step, memory)
-        # In each step the ports lose the speed `speed_loss` to the laws. The FMU gets the constant
-        # force that makes the same change, speed_gain^-1 speed_loss. The accelerations that the
-        # ports have without laws are those of the last step, with the loss to the laws added again.
+        # In each step the laws change the speeds of the ports by -speed_loss. The FMU gets the
+        # constant force that causes this change: -speed_gain^-1 speed_loss. The accelerations that
+        # the ports would have without laws are those of the last step plus its speed loss.
         asset, first_outputs, loads_by_input = self.start_run(run)
         outputs = [first_outputs]
         forces = np.column_stack([*loads_by_input.values()])  # (steps, inputs)
@@ -354,7 +355,8 @@ class FmuSimulator(FmuAtRest):
     ) -> tuple[FloatArray, FloatArray]:
         """Return the speeds of the P ports in the first step of a run, and how forces change them.
 
-        The step is run without probing forces, and then once for each port with a force there.
+        The step is made once without probing forces, and then once for each port with a probing
+        force at that port.
 
         Parameters
         ----------

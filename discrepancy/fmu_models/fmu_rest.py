@@ -52,11 +52,11 @@ class FmuAtRest(IdentifiedFmu):
     def solve_rest(
         self, states: Sequence[OperatingPoint], loads: Mapping[str, FloatArray]
     ) -> FloatArray:
-        """Return the outputs (L, C) at rest, for L states that differ in their inputs.
+        """Return the outputs (L, C) at rest in L rows, which differ in state and loads.
 
-        An FMU that is not quasi-static (`static.settle`) is stepped until its motion has decayed.
-        If it is linear, it is stepped without loads, and the changes by the loads are computed from
-        its static gain.
+        A quasi-static FMU makes one step for each row. Any other (`static.settle`) is stepped until
+        its motion has decayed; if it is linear, it is stepped without loads, and the changes of the
+        outputs by the loads are computed from its static gain.
 
         Parameters
         ----------
@@ -99,10 +99,10 @@ class FmuAtRest(IdentifiedFmu):
     ) -> bool:
         """Return whether the outputs at rest are linear in the loads on some inputs.
 
-        For each set of inputs this is tested once, under the loads of the first call, and kept: the
-        change of the outputs by the static gain is compared with that of the FMU itself. Since the
-        FMU is stepped over a long time, its errors may be as large as `LINEARITY_TOLERANCE` times
-        the change and the largest transient. The arguments are those of `_settled_outputs`.
+        The change of the outputs by the static gain is compared with the change of the FMU itself.
+        Because the FMU is stepped over a long time, the two may differ by `LINEARITY_TOLERANCE`
+        times the sum of the change and the largest transient. Each set of inputs is tested once,
+        under the loads of the first call. The arguments are those of `_settled_outputs`.
         """
         if names in self._linear_at_rest:
             return self._linear_at_rest[names]
@@ -154,9 +154,10 @@ class FmuAtRest(IdentifiedFmu):
         return self.asset.input_range("load", variable)[1]
 
     def port_flexibility(self, state: OperatingPoint) -> FloatArray:
-        """Return the flexibility (P, P) at rest: displacement of a port (row) per force (column).
+        """Return the displacements of the ports (rows) at rest by unit forces at ports (columns).
 
-        A force of the probing amplitude is applied at each port in turn.
+        This is the flexibility (P, P) [m/N]. A force of the probing amplitude is applied at one
+        port after the other.
         """
         if not self.ports:
             # there is nothing to compute, and the FMU may not accept loads of zero
@@ -241,11 +242,11 @@ class FmuAtRest(IdentifiedFmu):
         forces : (L, J) array
             The force of each law in each row.
         """
-        remaining = dict(loads)
+        remaining_loads = dict(loads)
         for port, force in zip(laws.ports, forces.T, strict=True):
             name = self.port_inputs[self.ports.index(port)]
-            remaining[name] = remaining.get(name, 0.0) - force
-        return remaining
+            remaining_loads[name] = remaining_loads.get(name, 0.0) - force
+        return remaining_loads
 
     def find_equilibrium_with_laws(
         self,

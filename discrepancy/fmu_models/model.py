@@ -118,9 +118,9 @@ class FmuModel(DescribedModel):
         self.fmu.close()
 
     def supports(self, primitive: type[Primitive]) -> bool:
-        """Return whether the model can carry a primitive.
+        """Return whether the model can have a primitive: whether its FMU has the inputs for it.
 
-        A primitive needs inputs of the FMU that the description names:
+        These are inputs that the description names:
 
         ========================  ==========================================
         sensors                   nothing, as they act on readings
@@ -198,10 +198,10 @@ class FmuModel(DescribedModel):
         return largest
 
     def _port_stiffnesses(self, campaign: Campaign, conditions: Conditions) -> list[PortStiffness]:
-        """Return the modal and the static stiffness of each port.
+        """Return the modal and the static stiffness of each port [N/m].
 
-        Both are those of the linear system in the first dynamic trial, if there is such a trial and
-        the FMU is linear in it. Otherwise the static stiffness is returned as the modal one too.
+        If there is a dynamic trial and the FMU is linear in the first one, they are computed from
+        its linear system. Otherwise both are the static stiffness of the FMU.
         """
         static_trial = first_trial(campaign, is_dynamic=False)
         if static_trial is None:
@@ -233,9 +233,9 @@ class FmuModel(DescribedModel):
     def _first_angular_frequency(self, campaign: Campaign, conditions: Conditions) -> float:
         """Return the angular frequency of the first mode [rad/s].
 
-        The frequency is that of the file, or else that of the FMU in the first dynamic trial. In a
-        campaign of trials at rest the result is 1 rad/s. Without trials the frequency is that of a
-        simulated ring-down.
+        The file of the model may state it. Otherwise it is found from the FMU in the first dynamic
+        trial, or, without any trial, in a simulated ring-down. In a campaign of trials at rest the
+        result is 1 rad/s.
         """
         angular_frequency = self.description.scales.angular_frequency
         if angular_frequency:
@@ -272,9 +272,9 @@ class FmuModel(DescribedModel):
     ) -> Response:
         """Return the outputs (N, C) of a trial, and their rates if it is dynamic.
 
-        The acting force is (1 + gain) times the recorded one, plus the tare at samples whose
-        recorded force is not zero. Raises `ModelError` if the trial is at rest, but an output is to
-        be differentiated.
+        The force that acts is (1 + gain) times the recorded one, plus the tare at samples whose
+        recorded force is not zero. Raises `ModelError` if the trial is at rest, but an output is a
+        velocity or an acceleration.
         """
         columns = self._output_columns(outputs)
         if trial.is_dynamic:

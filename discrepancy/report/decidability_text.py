@@ -26,16 +26,16 @@ WORDS_OF_KINDS = {
 
 
 def detectability_texts(detectability: Detectability) -> tuple[str, str, str]:
-    """Return texts on the detectability of an effect, for a row of a table.
+    """Return the texts on the detectability of an effect, for a row of a table.
 
     Returns
     -------
     visible : str
         Whether the effect is detectable at its prior median.
     least_size : str
-        Least detectable size, with unit.
+        The least detectable size, with unit.
     median : str
-        Prior median of its size, with unit; empty for an effect without a size.
+        The prior median of its size, with unit; empty for an effect without a size.
     """
     is_visible = detectability.distance >= DETECTION_DISTANCE
     visible = "yes" if is_visible else "larger than usual only"
@@ -154,14 +154,17 @@ def _sentence_on_group(
     kinds_of_effects: Sequence[frozenset[TrialKind]],
     missing_kinds: Collection[TrialKind],
 ) -> str:
-    """Return a sentence on trials or changes of load that distinguish similar effects.
+    """Return the sentence that says how to distinguish the effects of a group.
+
+    It names kinds of trials that some of the effects change and others do not. If there are none,
+    it asks for other loads.
 
     Parameters
     ----------
     group : sequence of str
         Identifiers of the effects.
     kinds_of_effects : sequence of frozenset of TrialKind
-        Kinds of trials that each of them changes.
+        Kinds of trials that each effect changes.
     missing_kinds : collection of TrialKind
         Kinds that are possible and not in the campaign.
     """
@@ -180,10 +183,10 @@ def _sentence_on_group(
 
 
 def _sentences_on_hidden_effects(separability: Separability) -> list[str]:
-    """Return the sentences on effects that these data show only if they are large.
+    """Return the sentences on effects that these data would not show at their prior median.
 
-    One is on the effects that less noise would show, one on those that the stated deviations of
-    other unknowns hide. There is none without such effects.
+    One sentence is on the effects that less noise would show; the others are on effects that
+    unknowns can imitate within their stated deviations.
     """
     hidden = [
         detectability
@@ -220,9 +223,9 @@ def _sentence_on_noise(hidden: Sequence[Detectability]) -> list[str]:
 
 
 def _sentences_on_unknowns(hidden: Sequence[Detectability]) -> list[str]:
-    """Return the sentences on the effects that other unknowns imitate within their deviations.
+    """Return a sentence for each set of unknowns that can imitate effects, and hide them thereby.
 
-    There is one sentence for each set of unknowns.
+    The unknowns imitate the effects within their stated deviations.
     """
     effects_by_unknowns: dict[tuple[str, ...], list[str]] = {}
     for detectability in hidden:

@@ -48,12 +48,12 @@ _LARGEST_DISTANCE = 1e4
 
 
 def pit_figure(scores: Mapping[str, Scores]) -> Figure | None:
-    """Draw histograms of probability integral transforms; None without scores.
+    """Draw histograms of probability integral transforms, a panel for each model; None without any.
 
     Parameters
     ----------
     scores : mapping of str to Scores
-        Scores before and after by the title of their panel.
+        The scores of one or two models, by the title of the panel.
     """
     if not scores:
         return None
@@ -118,9 +118,10 @@ def _heat_map_figure(
 
 
 def separability_figure(separability: Separability) -> Figure | None:
-    """Draw the squared distances between effects as a map: how well they can be distinguished.
+    """Draw a map of the squared distances between effects, which say how well data tell them apart.
 
-    Pairs that these data confuse are marked by a cross. None with fewer than two effects.
+    A cross marks each pair that these data cannot tell apart. The result is None with fewer than
+    two effects.
     """
     names = separability.identifiers
     if len(names) < 2:
@@ -172,10 +173,10 @@ MOST_FORCE_SAMPLES = 400
 
 
 def missing_force_figure(missing: MissingForce) -> Figure:
-    """Draw a missing force over displacement, speed and time.
+    """Draw a missing force over displacement, over speed and over time.
 
-    A force that follows another variable, such as an input, is drawn over that instead of speed. A
-    second row of panels shows the force that remains with the fitted law, if there is one.
+    If the force follows another variable, such as an input, it is drawn over that variable instead
+    of speed. If a law was fitted, a second row of panels shows the force that remains with it.
     """
     row_titles = {"force": "missing force"}
     if missing.law:
@@ -220,10 +221,6 @@ def _draw_over_time(axes: Axes, missing: MissingForce, series: str, *, has_law: 
 
     Parameters
     ----------
-    axes : Axes
-        The axes to draw on.
-    missing : MissingForce
-        The missing force.
     series : str
         "force", or "left" for the force that remains with its law.
     has_law : bool
@@ -375,11 +372,11 @@ def report_figures(content: ReportInput) -> dict[str, ReportFigure]:
     if investigation.proof is not None:
         before, after, trials = proof_scores(investigation.proof)
         scores = {"unchanged model": before, "with the effect": after}
-        with_pit = {title: score for title, score in scores.items() if score.pit}
+        scores_with_pit = {title: score for title, score in scores.items() if score.pit}
         trials_text = (
             "Held-out trials." if trials == "held-out" else "Fitted trials: none is held out."
         )
-        _add_figure(figures, "pit", pit_figure(with_pit), where=trials_text)
+        _add_figure(figures, "pit", pit_figure(scores_with_pit), where=trials_text)
     if content.separability is not None:
         figure = separability_figure(content.separability)
         _add_figure(figures, "separability", figure, confused=f"{CONFUSION_DISTANCE:g}")

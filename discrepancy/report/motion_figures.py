@@ -64,7 +64,7 @@ def worst_record(trials: Sequence[FittedTrial]) -> Worst | None:
 
 
 def history_figure(before: ResidualSet, after: ResidualSet | None, worst: Worst) -> Figure:
-    """Draw the worst record: readings and predictions, and the residuals with the noise.
+    """Draw the worst record: readings and predictions, and below them the residuals and the noise.
 
     Parameters
     ----------
@@ -75,7 +75,7 @@ def history_figure(before: ResidualSet, after: ResidualSet | None, worst: Worst)
     """
     fitted = before.trials[worst.trial]
     column = fitted.column(worst.channel)
-    used = fitted.used[:, column]
+    is_used = fitted.used[:, column]
     time = fitted.trial.time
     factor, unit = UNITS[before.channels[worst.channel].quantity].drawn
     drawn_models = models_to_draw(before, after)
@@ -85,8 +85,8 @@ def history_figure(before: ResidualSet, after: ResidualSet | None, worst: Worst)
         panel_count, 1, 1.45 * panel_count + 0.35, height_ratios=height_ratios, sharex=True
     )
     axes.margins(x=0.01)
-    readings = factor * fitted.trial.values[used, column]
-    axes.plot(time[used], readings, ".", ms=1.8, color=style.OBSERVED, label="measured")
+    readings = factor * fitted.trial.values[is_used, column]
+    axes.plot(time[is_used], readings, ".", ms=1.8, color=style.OBSERVED, label="measured")
     for drawn in drawn_models:
         prediction = factor * drawn.residuals.trials[worst.trial].prediction[:, column]
         axes.plot(time, prediction, drawn.dashes, lw=0.9, color=drawn.colour, label=drawn.label)
@@ -96,8 +96,8 @@ def history_figure(before: ResidualSet, after: ResidualSet | None, worst: Worst)
     for letter, panel, drawn in zip("bc", panels_below, drawn_models, strict=False):
         fitted_by_model = drawn.residuals.trials[worst.trial]
         draw_noise(panel, factor * float(fitted_by_model.noise_deviation[column]), 0.3)
-        residual = factor * fitted_by_model.residual[used, column]
-        panel.plot(time[used], residual, lw=0.6, color=drawn.colour)
+        residual = factor * fitted_by_model.residual[is_used, column]
+        panel.plot(time[is_used], residual, lw=0.6, color=drawn.colour)
         panel.set(ylabel=f"residual, {unit}", title=f"{letter}  residual, {drawn.label}")
     panels_below[0].legend(**ABOVE)
     figure.axes[-1].set_xlabel("time, s")
@@ -107,7 +107,8 @@ def history_figure(before: ResidualSet, after: ResidualSet | None, worst: Worst)
 def spectrum_figure(before: ResidualSet, after: ResidualSet | None, worst: Worst) -> Figure | None:
     """Draw the spectra of the residuals of the worst channel, averaged over the dynamic trials.
 
-    The power is relative to white noise of the stated variance. None if no trial is long enough.
+    The power is relative to white noise of the stated variance. The result is None if no trial is
+    long enough.
     """
     spectra = []
     for drawn in models_to_draw(before, after):
@@ -174,7 +175,7 @@ def _mean_spectrum(residuals: ResidualSet, channel: str) -> _Spectrum | None:
     """Return the mean spectrum of a channel's residuals over the dynamic trials.
 
     Trials of different lengths have spectra at different frequencies; only the largest group of
-    trials with equal frequencies is averaged. None if no trial has 32 samples.
+    trials with equal frequencies is averaged. The result is None if no trial has 32 samples.
     """
     groups: dict[float, list[_Spectrum]] = {}
     for fitted, column, _ in channel_fits(residuals.trials, channel):
@@ -182,8 +183,8 @@ def _mean_spectrum(residuals: ResidualSet, channel: str) -> _Spectrum | None:
             continue
         interval = fitted.trial.interval
         series = np.nan_to_num(fitted.standardised[:, column])
-        segment = min(len(series), 512)
-        frequency, power = welch(series, 1.0 / interval, nperseg=segment, detrend="constant")
+        segment_length = min(len(series), 512)
+        frequency, power = welch(series, 1.0 / interval, nperseg=segment_length, detrend="constant")
         resolution = round(interval * len(frequency), 9)
         spectrum = _Spectrum(frequency[1:], power[1:] * 0.5 / interval)
         groups.setdefault(resolution, []).append(spectrum)
@@ -204,7 +205,7 @@ def mode_frequencies(residuals: ResidualSet) -> tuple[float, ...]:
 
 
 def backbone_figure(before: ResidualSet, after: ResidualSet | None) -> tuple[Figure, str] | None:
-    """Draw frequency and damping ratio of the ring-downs over the amplitude.
+    """Draw frequency and damping ratio of the ring-downs over the amplitude (the backbone curves).
 
     Parameters
     ----------
@@ -316,21 +317,17 @@ def _limit_to_measured(axes: Axes, values: FloatArray) -> None:
 def _backbones_by_mode(
     residuals: ResidualSet, channel: str, frequencies: Sequence[float], *, measured: bool = False
 ) -> dict[int, Backbone]:
-    """Return the backbones of the ring-downs by mode, of the predictions or of the readings.
+    """Return the backbone curve of each mode: frequency and damping over amplitude.
 
-    Points with large errors are left out. The points of different ring-downs are separated by nan,
+    Points with large errors are left out. The points of different ring-downs are separated by NaN,
     so that no line connects them.
 
     Parameters
     ----------
-    residuals : ResidualSet
-        The ring-downs.
-    channel : str
-        Name of the channel.
     frequencies : sequence of float
-        Start values of the frequencies [Hz].
+        The frequencies of the modes, from which their identification starts [Hz].
     measured : bool
-        True for the readings.
+        True for curves of the readings, False for curves of the predictions.
     """
     backbones_of_modes: dict[int, list[Backbone]] = {}
     for fitted, column, used in channel_fits(residuals.trials, channel):

@@ -114,7 +114,7 @@ def verdict_page(content: ReportInput, figures: Mapping[str, PageFigure]) -> Pag
 
 
 def _outcome(content: ReportInput) -> list[Block]:
-    """Return the verdict in figures, and folded below them in sentences."""
+    """Return the blocks of the outcome: the verdict in numbers and, folded below, in sentences."""
     investigation = content.investigation
     verdict = investigation.verdict
     catalogue: dict[str, Effect] = {}
@@ -145,15 +145,16 @@ def verdict_card(verdict: Verdict) -> str:
     """Return the verdict in one line: what is missing, where, how large, and how sure that is.
 
     The size is the missing force at its port or, if there is no such force, the first parameter of
-    a named effect with its 90 % interval. Without a name, the card says what the force depends on.
-    If nothing is missing, the parameter, gain or zero that
-    the fit moves farthest is mentioned.
+    a named effect with its 90 % interval. If no effect is named, the card says what the force
+    depends on. If nothing is missing, it mentions the parameter, gain or zero that the fit moves
+    farthest.
     """
     clauses = [f"{capital(missing_effects_text(verdict))} {OPENING[verdict.kind]}"]
-    moved = (*verdict.moved, *verdict.moved_within_prior)
-    if verdict.kind in KINDS_WITHOUT_GAP and moved:
+    moved_unknowns = (*verdict.moved, *verdict.moved_within_prior)
+    if verdict.kind in KINDS_WITHOUT_GAP and moved_unknowns:
+        farthest = moved_unknowns[0]
         clauses.append(
-            f"but with {moved[0].name} moved by {abs(moved[0].deviations):.1f} stated deviations, "
+            f"but with {farthest.name} moved by {abs(farthest.deviations):.1f} stated deviations, "
             "where an error of the model may hide"
         )
     curve = curve_of(verdict.effects)
@@ -306,7 +307,7 @@ def _location_section(investigation: Investigation, figures: Mapping[str, PageFi
 
 
 def _location_sentence(location: Location | None, *, has_no_gap: bool) -> str:
-    """Return whether the residuals of the unchanged model stand out, and in how many cells."""
+    """Say whether the residuals of the unchanged model exceed the noise, and in how many cells."""
     if location is None:
         return "The residuals were not searched for patterns."
     if location.disagrees:

@@ -67,10 +67,10 @@ def global_tests_table(location: Location) -> Table:
 
 
 def parameter_rows(investigation: Investigation) -> list[tuple[str, ...]]:
-    """Return the rows of the model's parameters: name, unit, and values with 90 % half-widths.
+    """Return a row for each parameter of the model: name, unit, and values with 90 % half-widths.
 
-    Values are those of the calibration, of the fit of the unchanged model, and of the fit with the
-    effect. Without an effect the last is left out; without parameters there are no rows.
+    The values are those of the calibration, of the fit of the unchanged model and, if there is an
+    effect, of the fit with it.
     """
     problem, search, fit = investigation.problem, investigation.search, investigation.fit
     if problem is None or search is None or fit is None:
@@ -151,7 +151,7 @@ def _score_cells(scores: Scores) -> dict[str, str]:
 def proof_table(investigation: Investigation, proof: Proof) -> Table:
     """Return the table of the scores of fitted and held-out trials, without and with the effects.
 
-    The last rows are the rms of the residuals of each channel, in the unit in which it is drawn.
+    The last rows have the rms residual of each channel, in the unit in which it is drawn.
     """
     scores_by_title = {
         "held out, before": proof.held_out_before,
@@ -202,7 +202,7 @@ def _rms_rows(
 
 
 def _proof_caption(investigation: Investigation, proof: Proof) -> str:
-    """Return the gain in log score, the share of the error taken away, and the held-out trials."""
+    """Return the caption of the proof: gain in log score, error taken away, and held-out trials."""
     sentences = []
     if proof.held_out_after is None:
         sentences.append("Nothing is held out, so that nothing is proved.")

@@ -91,7 +91,7 @@ def write_rig_campaign(rig: str, data: Path, folder: Path, **options: object) ->
 def _read_numbers(
     file: Path, columns: Sequence[str], separator: str | None = ",", skipped: int = 1
 ) -> dict[str, FloatArray]:
-    """Return the first columns (N,) of a published table, by the names given in their order.
+    """Return the first columns (N,) of a published table by the given names, in this order.
 
     `separator` is None for blanks between cells, and `skipped` the number of lines before the first
     line of numbers. Raises `CampaignFileError` if there is no such file, if it has fewer than 8
@@ -118,8 +118,8 @@ def _read_numbers(
 def longest_fall(file: Path) -> tuple[FloatArray, FloatArray]:
     """Return the longest free fall in a record of a phone, without `END_CUT` seconds at its ends.
 
-    The accelerometer of a phone in free fall reads nearly zero, as it shows acceleration minus
-    gravity. The phone falls while the absolute reading is below `LARGEST_FALLING_READING`.
+    An accelerometer shows acceleration minus gravity, and so reads nearly zero in free fall. The
+    phone falls while the absolute reading is below `LARGEST_FALLING_READING`.
 
     Returns
     -------

@@ -402,11 +402,11 @@ class Model(ABC):
     def respond(
         self, trial: Trial, outputs: Outputs, patch: ModelPatch, conditions: Conditions
     ) -> Response:
-        """Return the true response of a trial, before any sensor. Sensors in the patch are ignored.
+        """Return the true response of a trial: no errors of sensors act, not even of the patch.
 
-        Where an output is wanted as a velocity or acceleration, it is differentiated in time; as a
-        signal, it is returned unchanged. A model with a response cache answers a repeated request
-        from there.
+        An output that is wanted as a velocity or an acceleration is differentiated in time; one
+        that is wanted as a signal is returned unchanged. A model with a response cache takes a
+        repeated response from there.
 
         Parameters
         ----------

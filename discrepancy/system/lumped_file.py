@@ -254,7 +254,10 @@ class LumpedDescription(ModelDescription):
     # ------------------------------------------------------------ checks of a file
 
     def checks(self) -> Iterator[Check]:
-        """Yield the checks that concern several tables of the file, each with its message."""
+        """Yield the checks that concern several tables of the file.
+
+        A check is a pair: whether the file fails it, and the message of the error.
+        """
         yield from self._missing_matrix_checks()
         yield from self._name_checks()
         yield from self._vanishing_matrix_checks()
@@ -297,8 +300,8 @@ class LumpedDescription(ModelDescription):
         """Yield the checks on the size, symmetry and definiteness of the matrices of a kind.
 
         Size and symmetry concern each matrix, definiteness the sum of a base matrix and its parts.
-        Each check says whether it has failed, and with which message. The caller stops at the first
-        that has, so the checks after that of the size may rely on it.
+        The caller stops at the first check that fails, so that checks after that of the size may
+        rely on it.
         """
         matrices = self.matrices_of(kind)
         for name, matrix in matrices.items():
@@ -381,21 +384,21 @@ class LumpedDescription(ModelDescription):
         `station_derivative` may be). That of a port or a controller must not read displacements and
         states at once. A controller must not need the derivative of a speed or of a state.
         """
-        n = self.displacement_count
-        unknowns = n + self.state_count
+        displacement_count = self.displacement_count
+        unknown_count = displacement_count + self.state_count
         for key in ("vector", "acts", "station_derivative"):
             vector = getattr(section, key, None)
             if vector is None:
                 continue
             place = f"{key} of {kind} {section.name!r}"
             yield (
-                len(vector) != unknowns,
+                len(vector) != unknown_count,
                 f"{place} has {counted(len(vector), 'entry', 'entries')}, but the model has "
-                f"{counted(unknowns, 'unknown')}",
+                f"{counted(unknown_count, 'unknown')}",
             )
             yield key != "station_derivative" and not any(vector), f"{place} is zero"
         row = np.array(section.vector or ())
-        sees_both = any(row[:n]) and any(row[n:])
+        sees_both = any(row[:displacement_count]) and any(row[displacement_count:])
         yield (
             kind in ("port", "controller") and sees_both,
             f"the {kind} {section.name!r} sees displacements or states, not both",
@@ -406,7 +409,7 @@ class LumpedDescription(ModelDescription):
             yield self._prescribed_state_check(section, row)
         if isinstance(section, ControllerSection):
             order = section.quantity.order
-            sees_speed = order > 0 or any(row[n:])
+            sees_speed = order > 0 or any(row[displacement_count:])
             yield (
                 order > 1 or (sees_speed and section.derivative),
                 f"the controller {section.name!r} cannot follow an acceleration, nor the "
@@ -427,8 +430,9 @@ class LumpedDescription(ModelDescription):
     def _flow_check(self, port: PortSection, row: FloatArray, acts: FloatArray) -> Check:
         """Return the check that a flow at a port of states lowers the reading of the port.
 
-        A unit flow along `acts` changes the states at the rate capacity^-1 acts, and the reading
-        row . states of the port at the rate row . capacity^-1 acts, which must be positive.
+        A unit flow out of the port changes the states at the rate -capacity^-1 acts, and hence the
+        reading row . states of the port at the rate -row . capacity^-1 acts, which must be
+        negative.
         """
         n = self.displacement_count
         is_of_states = not any(row[:n]) and not any(acts[:n])
@@ -441,7 +445,7 @@ class LumpedDescription(ModelDescription):
         )
 
     def _name_checks(self) -> Iterator[Check]:
-        """Yield the names that occur twice, and the references to names that do not exist."""
+        """Yield the checks on names that occur twice, and on references to unknown names."""
         kinds = ("output", "port", "place", "load", "controller", "law", "parameter", "input")
         names = {kind: [section.name for section in getattr(self, kind)] for kind in kinds}
         part_names: list[str] = []

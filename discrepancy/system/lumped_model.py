@@ -80,9 +80,7 @@ class LumpedModel(DescribedModel, SystemModel):
     # ------------------------------------------------------------ what it is
 
     def supports(self, primitive: type[Primitive]) -> bool:
-        """Return whether a patch of this model may hold a primitive.
-
-        It needs that on which the primitive acts:
+        """Return whether the model can have a primitive: whether it has what this acts on.
 
         ======================  ======================================================
         laws of the velocity    a port
@@ -226,9 +224,9 @@ class LumpedModel(DescribedModel, SystemModel):
         return Load(self.law_directions[primitive.port], history)
 
     def _offset_inputs(self, case: PatchedTrial) -> dict[str, OffsetInput]:
-        """Return the recorded inputs of a driven trial, with their offsets, by name.
+        """Return the recorded inputs of a trial by name, each with its offset.
 
-        For another kind of trial the only input is its force at its load place.
+        A driven trial has inputs of its own; any other has its force as the only one.
         """
         trial = case.trial
         recorded_inputs = trial.inputs
@@ -362,10 +360,11 @@ class LumpedModel(DescribedModel, SystemModel):
     def _reaction_equation(
         self, section: OutputSection, case: PatchedTrial, excitation: Excitation | None
     ) -> OutputEquation:
-        """Return the equation of an output that is the force that a prescribed motion needs.
+        """Return the equation of an output that is the force which a prescribed motion needs.
 
-        By the equation of motion along the drive it is K u + C u' + M u'' minus the loads, plus the
-        forces of laws there. Raises `ModelError` if the trial does not prescribe the motion.
+        By the equation of motion along the drive, this force is K u + C u' + M u'' minus the loads,
+        plus the forces of laws there. Raises `ModelError` if the trial does not prescribe the
+        motion.
         """
         drive_names = [] if excitation is None else list(excitation.prescribed_motions)
         if excitation is None or section.reaction not in drive_names:
@@ -414,10 +413,10 @@ class LumpedModel(DescribedModel, SystemModel):
     def build_system(self, state: SystemState) -> LinearSystem:
         """Return the linear system in a state, with its prescribed motions and controllers.
 
-        A controller adds to the matrices K, D and M of the left-hand side K z + D z' + M z'': minus
-        its output, which is a load. The integral s of its error, s' = reference - measured, is a
-        further state, the speed of its unknown in z. So M has a one there, and the measured
-        quantity is added on the left-hand side.
+        The output of a controller is a load, so that it is subtracted from the left-hand side
+        K z + D z' + M z'' of the equation of motion. The integral s of its error, with
+        s' = reference - measured, is a further state: the speed z' of an unknown of its own. In the
+        row of this unknown, M has a one, and the measured quantity is added to the left-hand side.
         """
         description = self.description
         rig = self.rig_in_state(state)

@@ -108,10 +108,10 @@ class Motion:
         return self.q @ shapes + without_inertia, self.velocity @ shapes
 
     def _displacements_without_inertia(self, rows: FloatArray) -> FloatArray:
-        """Return the displacements row . u in the modes without inertia, as (N, C) for rows (C, n).
+        """Return what the modes without inertia add to displacements `rows @ u`: (N, C).
 
-        Applied forces deform these high modes at once. Internal forces, and the end of a holding
-        force, deform them with the first-order lag of their damping.
+        `rows` is a (C, n) array. Applied forces deform these high modes at once. Internal forces,
+        and the end of a holding force, deform them with the first-order lag of their damping.
         """
         system = self.system
         residual_flexibility = system.residual_displacements(rows.T)  # (n, C)
@@ -134,8 +134,9 @@ class Motion:
     def response(self, equations: Sequence[OutputEquation]) -> Response:
         """Return the values and rates (N, C) of outputs at all samples, given their C equations.
 
-        Modes without inertia contribute only to outputs that are not differentiated, and not to
-        rates. The rates of outputs with a direct load or force of laws are differences in time.
+        Modes without inertia contribute only to the values of displacements and strains, not to
+        rates. The rate of an output on which a load or a force of laws acts directly is the
+        difference quotient of its values in time.
         """
         values, rates = self._outputs_of_modal_motion(equations)
         if self.system.is_truncated:
@@ -202,7 +203,7 @@ def simulate_motion(
         The laws of the internal forces at ports; a drift of the stiffness counts from the first
         time of the record.
     refinement : int
-        Time steps are this many times smaller than usual.
+        The factor by which time steps are smaller than usual.
 
     Raises
     ------
@@ -219,19 +220,19 @@ def simulate_motion(
 def _motion_from_record(
     system: LinearSystem, excitation: Excitation, laws: PortLaws, refinement: int
 ) -> Motion:
-    """Return the motion under recorded inputs, from the first time stamp of the record on."""
+    """Return the motion under recorded inputs, which begins at the first time of the record."""
     times = excitation.sample_times
     first_stamp = float(excitation.time[0])
-    begin = state_at_first_stamp(system, excitation, laws)
-    motion = _integrate_from(system, excitation, laws, first_stamp, times, begin, refinement)
+    first_state = state_at_first_stamp(system, excitation, laws)
+    motion = _integrate_from(system, excitation, laws, first_stamp, times, first_state, refinement)
     starts_at_sample = excitation.begins is not Start.UNKNOWN and times[0] <= first_stamp
     if starts_at_sample and len(laws) and len(system.drives):
         # A speed-dependent law at a port that only drives move has no force at the start if the
         # drives begin at rest. The kernel instead computes the force that would hold the drive's
         # coordinate like a free mass, which no reading contains.
-        rows = laws.port_rows(system.modal_system.ports, len(begin.v))  # (J, M + P)
+        rows = laws.port_rows(system.modal_system.ports, len(first_state.v))  # (J, M + P)
         is_driven = ~np.any(rows[:, : len(system.angular_frequency)], axis=1)
-        is_still = rows @ begin.v == 0.0
+        is_still = rows @ first_state.v == 0.0
         motion.port_forces[0, is_driven & is_still & (laws.depends_on_speed == 1)] = 0.0
     return Motion(
         system,
@@ -254,13 +255,13 @@ def _motion_from_release(
 ) -> Motion:
     """Return the motion after a release at time zero.
 
-    Before a release from rest, the structure is held in its shape. If the release is not from rest
-    and the clock puts samples before time zero, the motion is continued backwards in time to the
-    first of them, without internal forces.
+    Samples before a release from rest show the structure in the shape in which it is held. If the
+    release is not from rest and the clock puts samples before time zero, the motion is continued
+    backwards in time to the first of them, without internal forces.
     """
     times = excitation.sample_times
     released = released_state(system, excitation, point, laws)
-    begin = released.begin
+    first_state = released.begin
     # The integration needs two times. If at most one sample follows the release, another time is
     # appended, which `_with_held_samples` cuts off again.
     held_count = int(np.searchsorted(times, 0.0)) if point.release.at_rest else 0
@@ -270,8 +271,10 @@ def _motion_from_release(
     if stamps[0] < 0.0:
         # the transition matrix (2 M, 2 M) of the linear system over a negative time step
         transition_back = system.modal_system.exact_steps(stamps[:1])[0][0]
-        begin = InitialMotion(*np.split(transition_back @ np.concatenate((begin.q, begin.v)), 2))
-    motion = _integrate_from(system, excitation, laws, 0.0, stamps, begin, refinement)
+        first_state = InitialMotion(
+            *np.split(transition_back @ np.concatenate((first_state.q, first_state.v)), 2)
+        )
+    motion = _integrate_from(system, excitation, laws, 0.0, stamps, first_state, refinement)
     if held_count:
         motion = _with_held_samples(motion, released.begin, held_count, len(times))
     return Motion(
@@ -291,10 +294,9 @@ def _motion_from_release(
 def _with_held_samples(
     motion: ModalMotion, begin: InitialMotion, held_count: int, count: int
 ) -> ModalMotion:
-    """Return a motion of `count` samples, with the held shape in the first `held_count` of them.
+    """Put `held_count` samples of the held shape before a motion, and cut it after `count` samples.
 
-    `motion` is that after the release; samples beyond `count` are cut off. `begin` is the state at
-    the release, which is that of the held shape.
+    `motion` is that after the release; `begin` is the state at the release: the held shape.
     """
     law_count = motion.port_forces.shape[1]
     forces = np.zeros(law_count) if begin.memory is None else begin.memory[:, LAGGED_FORCE]
@@ -326,8 +328,8 @@ def _integrate_from(
 ) -> ModalMotion:
     """Return the motion at the sample times (N,) [s], given the state at `first_time` [s].
 
-    If the first sample is not later than `first_time`, beyond rounding, the state is taken as that
-    at the first sample.
+    If the first sample is not later than `first_time` (but for rounding), the given state is taken
+    as the state at the first sample.
     """
     duration = sample_times[-1] - sample_times[0]
     tolerance = LEAST_LEAD * duration / max(len(sample_times) - 1, 1)
@@ -344,8 +346,10 @@ def _integrate_from(
     if not is_late:
         return _integrate_in_steps(system, excitation, laws, sample_times, first_state, refinement)
     # integrate from the earlier begin, and leave out the start itself
-    from_begin = np.append(first_time, sample_times)
-    motion = _integrate_in_steps(system, excitation, laws, from_begin, first_state, refinement)
+    times_with_start = np.append(first_time, sample_times)
+    motion = _integrate_in_steps(
+        system, excitation, laws, times_with_start, first_state, refinement
+    )
     return motion._replace(
         q=motion.q[1:],
         v=motion.v[1:],

@@ -48,11 +48,11 @@ class OutputsForSensors(NamedTuple):
 
 
 def shift_clock_to_first_sample(trial: Trial, patch: ModelPatch) -> tuple[Trial, ModelPatch]:
-    """Return a trial and its patch with times counted from the first sample, if it is far from 0.
+    """Count the times of a trial and its patch from the first sample, if this is far from zero.
 
-    Models count time from the start of the trial, but time stamps may count from an epoch, or from
-    the start of a logger. Time stamps stay as they are if the first one is closer to zero than the
-    record is long, since a release happens at zero.
+    Models count time from the start of the trial, but time stamps may count from an epoch or from
+    the start of a logger. If the first time stamp is closer to zero than the record is long, all
+    stay as they are, since a release happens at zero.
 
     Parameters
     ----------
@@ -134,12 +134,11 @@ def observe(
 def _outputs_for_sensors(
     model: Model, campaign: Campaign, trial: Trial, patch: ModelPatch
 ) -> OutputsForSensors:
-    """Return the outputs that a model has to compute for a trial, and the columns of its strains.
+    """Return the outputs that a model has to compute for the channels of a trial.
 
-    - If the patch turns no gauge, the outputs are those of the channels, and no columns are
-      returned, because no strain is needed beside them.
-    - If it turns a gauge, the transverse and the shear strain are added for every strain channel,
-      also for one that is not turned: `observe_response` decides which channels turn.
+    If the patch turns a gauge, the transverse and the shear strain are needed as well. They are
+    added for every strain channel, whether it is turned or not (`observe_response` decides that),
+    and the columns of these channels are returned. Otherwise no columns are returned.
 
     Raises
     ------
@@ -174,10 +173,10 @@ def _response_in_clocks(
     conditions: Conditions,
     needed: OutputsForSensors,
 ) -> Response:
-    """Return the response of all needed outputs at the sample times of their own loggers.
+    """Return the response of all needed outputs, each at the times at which its logger samples.
 
-    The recorded inputs are first brought to their true times. All loggers agree at the first
-    sample; the model is run once for each distinct rate of their clocks.
+    The recorded inputs are first brought to their true times. The clocks of all loggers agree at
+    the first sample; the model is run once for each distinct rate of the clocks.
     """
     without_sensors = patch.without(*SENSORS)
     patch_rate, patch_zero = clock_of(patch)
@@ -214,11 +213,12 @@ def _response_in_clocks(
 
 
 def _logger_rates(campaign: Campaign, trial: Trial, patch: ModelPatch) -> LoggerRates:
-    """Return the clock errors (rate minus one) of a trial's inputs and channels.
+    """Return the clock errors of a trial's inputs and channels, by the `LoggerClock` of the patch.
 
-    By the primitive `LoggerClock`, what has the time stamp t happened at (1 + error) t. If several
-    act on one channel, their rates multiply. A trial at rest has no clock, so that its errors are
-    zero. Raises `CatalogueError` if the patch names a logger that the campaign does not have.
+    With a clock error e, a sample with the time stamp t was taken at (1 + e) t. If several
+    primitives act on one channel, their factors 1 + e are multiplied. A trial at rest has no clock,
+    so that its errors are zero. Raises `CatalogueError` if the patch names a logger that the
+    campaign does not have.
     """
     input_factor = 1.0
     channel_factors = np.ones(len(trial.channels))

@@ -141,15 +141,17 @@ class StructureModel(SystemModel):
         self.ports = tuple(self.port_rows)
 
     def _name_changes(self, model: ChangeableModel) -> None:
-        """Set the attributes that say which changes the structure may have."""
+        """Set the attributes that say which changes the structure may have, from its model."""
         self.support_motions = tuple(zip(model.supports, model.motions, strict=True))
         self.mass_places = model.mass_places
         reaches = zip(model.mass_places, model.mass_reaches.tolist(), strict=True)
         self.shows_weight = bool(model.load_accelerations.any())
         self.mass_reaches = {place: reach for place, reach in reaches if reach > 0.0}
         self.loss_places = model.loss_places
-        with_gauges = np.unique(model.patch_of_gauge[model.patch_of_gauge >= 0]).tolist()
-        self.places_with_gauges = frozenset(model.loss_places[number] for number in with_gauges)
+        patches_with_gauges = np.unique(model.patch_of_gauge[model.patch_of_gauge >= 0]).tolist()
+        self.places_with_gauges = frozenset(
+            model.loss_places[number] for number in patches_with_gauges
+        )
         losses_of_patches = dict.fromkeys(model.loss_places, LARGEST_LOSS)
         self.largest_losses = {**self.largest_losses, **losses_of_patches}
         self.length = model.size
@@ -268,9 +270,9 @@ class StructureModel(SystemModel):
     def output_equations(
         self, case: PatchedTrial, outputs: Outputs, excitation: Excitation | None
     ) -> list[OutputEquation]:
-        """Return the equations of outputs, with strains at the places of shifted gauges.
+        """Return the equations of outputs; the strain of a shifted gauge is that at its true place.
 
-        Strain beside a gauge follows from a Taylor series of second order in the distance.
+        This strain follows from a Taylor series of second order in the distance of the shift.
         """
         rows = self._rows_of_changes(self._changes_of(case.state))
         shifts = [item for item in case.patch if isinstance(item, changes.GaugeOffset)]
@@ -287,9 +289,7 @@ class StructureModel(SystemModel):
         return equations
 
     def supports(self, primitive: type[Primitive]) -> bool:
-        """Return whether the structure can carry a primitive.
-
-        It needs that on which the primitive acts:
+        """Return whether the structure can have a primitive: whether it has what this acts on.
 
         ==========================  ==========================================
         internal forces             a port
@@ -338,9 +338,9 @@ class StructureModel(SystemModel):
     def force_row(
         self, place: Place, state: SystemState, change: ModelPatch = NO_PATCH
     ) -> FloatArray:
-        """Return the load (k,) of a force of 1 N, or of load factor 1 if there are no forces.
+        """Return the load (k,) of a force of 1 N, or of the load factor 1 if there are no forces.
 
-        The primitives of `change` may alter the place and the direction of the force.
+        Primitives in `change` may move and turn the force.
 
         Raises
         ------

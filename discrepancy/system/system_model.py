@@ -246,11 +246,11 @@ class SystemModel(Model):
     def _respond(
         self, trial: Trial, outputs: Outputs, patch: ModelPatch, conditions: Conditions
     ) -> Response:
-        """Return the response of a trial, without rates for a trial at rest.
+        """Return the outputs of a trial, and for a dynamic trial also their rates.
 
-        The acting force is (1 + gain) times the recorded one, plus the tare at samples whose
-        recorded force is not zero. In a dynamic trial the structure has the temperature, and the
-        damage, of the first sample throughout.
+        The force that acts is (1 + gain) times the recorded one, plus the tare at samples whose
+        recorded force is not zero. In a dynamic trial the structure keeps the temperature and the
+        damage of the first sample.
         """
         laws = self.laws_at_ports(conditions.parameters, patch)
         case = self.patched_trial(trial, conditions, patch)
@@ -391,10 +391,11 @@ class SystemModel(Model):
         return natural_state_magnitudes(motion, equations, trial)
 
     def scales(self, campaign: Campaign) -> Scales:
-        """Return the natural scales under a campaign, at the prior mean and without a patch.
+        """Return the natural scales of length, force, frequency and so on under a campaign.
 
-        If springs hold the structure and all trials are moved by forces alone, from rest, its
-        stiffness and first mode give the scales. Otherwise the loads and motions of the trials do.
+        They hold at the prior mean and without a patch. If springs hold the structure and all
+        trials begin at rest, its stiffness and its first mode give the scales. Otherwise the loads
+        and motions of the trials do.
         """
         trials = campaign.trials
         parameters = self.prior_mean(campaign)
@@ -474,10 +475,10 @@ class SystemModel(Model):
     def _scales_of_held_structure(
         self, system: LinearSystem, state: SystemState, campaign: Campaign
     ) -> GlobalScales:
-        """Return the scales of a structure that is supported by springs.
+        """Return stiffness, mass and frequency scales of a structure that is held by springs.
 
-        Stiffness and mass are those at the reference load place of the model, or else at the load
-        place of the first trial, or else at the first load place of the model.
+        Stiffness and mass are those at a load place: the reference of the model, or else the load
+        place of the first trial, or else the first load place of the model.
         """
         places = [*(trial.load_place for trial in campaign.trials), *(self.load_places or ())]
         load_row = self.force_row(self.reference or places[0], state)
@@ -498,9 +499,9 @@ class SystemModel(Model):
     def _motion_under_inputs(self, campaign: Campaign, trial: Trial) -> Motion:
         """Return the motion of a trial under its recorded inputs, at the prior mean.
 
-        If it cannot begin as the trial states, it begins from rest. If nothing then moves, the
-        structure was released by hand, and the motion begins with the typical magnitudes of an
-        unknown initial state.
+        If the start that the trial states cannot be computed, the motion begins at rest. If nothing
+        moves, the structure was released by hand, and the motion begins with the typical magnitudes
+        of an unknown initial state.
         """
         conditions = Conditions(self.prior_mean(campaign))
         laws = self.laws_at_ports(conditions.parameters)
@@ -545,12 +546,12 @@ def _output_rows_at_rest(
     equations: Sequence[OutputEquation],
     displacement_count: int,
 ) -> FloatArray:
-    """Return the rows (C, N) that give the C outputs of a structure at rest from its N unknowns.
+    """Return the matrix (C, N) that gives the C outputs of a structure at rest from its N unknowns.
 
-    At rest an output depends on displacements, by row 0 of its equation, and on the values of
-    states of first order, which are the rates of their unknowns, by row 1. The first
-    `displacement_count` unknowns are displacements, the others states. Raises `ModelError` if an
-    output is a velocity, an acceleration or the rate of a state.
+    The first `displacement_count` unknowns are displacements. The others are integrals of states of
+    first order, so that the rate of such an unknown is the value of its state. At rest an output
+    depends on displacements (row 0 of its equation) and on values of states (row 1). Raises
+    `ModelError` if an output is a velocity, an acceleration or the rate of a state.
     """
     output_rows = []
     for (_, quantity), equation in zip(outputs, equations, strict=True):

@@ -104,8 +104,8 @@ class EffectLaws:
             laws = self._laws_in_patch(self._patch_of_all_laws(arguments))
         except (DiscrepancyError, InvalidPatchError):
             return None
-        # Windows are half as wide as those of the linear laws: there, a body that is held at rest
-        # is then well within the window.
+        # The smoothed steps of friction are half as wide as in the linearised laws, so that a body
+        # at rest in this motion lies well within the window of the linearised laws.
         rms_speeds = np.sqrt(np.mean(arguments.trajectory.speeds**2, axis=0))
         return motion_under_laws(
             self.trials[arguments.trial_index],
@@ -127,14 +127,14 @@ class EffectLaws:
         trial_index = self.trial_indices[arguments.trial_index]
         all_local_values = [np.zeros(0)] * len(self.problem.trials)
         all_local_values[trial_index] = local_values
-        point = Point(arguments.shared, tuple(all_local_values), arguments.effect)
+        unknowns = Point(arguments.shared, tuple(all_local_values), arguments.effect)
         try:
             patch = self.evaluate_model_laws(arguments.shared)
             patch = patch + self._patch_in_trial(arguments.trial_index, arguments.effect)
             response, _ = self.problem.response(trial_index, arguments.shared, local_values, patch)
         except (DiscrepancyError, InvalidPatchError):
             return None
-        prediction = self.problem.prediction(trial_index, point, response)
+        prediction = self.problem.prediction(trial_index, unknowns, response)
         readings = self.problem.trials[trial_index].trial.values
         return np.asarray((readings - prediction) / trial.deviation)[:: trial.stride]
 
@@ -158,10 +158,10 @@ class EffectLaws:
         return laws_of_model + changes.of(PortForce)
 
     def _linearised_forces(self, arguments: LawArguments) -> dict[int, LinearisedForce]:
-        """Return the forces of all laws, by port, with their derivatives by unknowns.
+        """Return the forces of all laws at each port, with their derivatives by unknowns.
 
-        A derivative by an unknown needs only the laws that the unknown changes: those of the model
-        or those of one effect. The K shared unknowns are numbered first, then those of the effects.
+        The K shared unknowns are numbered first, then those of the effects. For the derivative by
+        an unknown only the laws that it changes are evaluated: those of the model or of one effect.
         """
         forces = self._forces_of_patch(arguments, self.evaluate_model_laws(arguments.shared))
         by_model = {port: force.force for port, force in forces.items()}
@@ -198,21 +198,21 @@ class EffectLaws:
         number: int,
         forces_below: Mapping[int, LawForce] | None = None,
     ) -> dict[int, FloatArray]:
-        """Return the derivatives (F,) of forces at ports by an unknown, if they are not zero.
+        """Return the derivative (F,) of the force at each port by one unknown, where not zero.
 
         Parameters
         ----------
         arguments : LawArguments
             The trial and its motion.
         laws_at : callable
-            The function that takes values of unknowns and returns laws.
+            Returns the laws for given values of some unknowns.
         values : array
             The present values of these unknowns.
         number : int
-            The number of the unknown among them.
+            The index of the one unknown among them.
         forces_below : mapping of int to LawForce, optional
-            The forces at the present values, for a difference to one side, which is exact if the
-            forces are linear in the unknown; a central difference without them.
+            The forces at the present values. If given, the derivative is a one-sided difference,
+            which is exact if the forces are linear in the unknown; else it is a central one.
         """
         difference = HALF_DIFFERENCE
         if forces_below is None:
@@ -249,11 +249,11 @@ class EffectLaws:
 
     @cached_property
     def _kept_patches(self) -> Callable[[int, bytes], ModelPatch]:
-        """The change of the model by one effect, given its index and the bytes of its unknowns.
+        """A function that returns the patch of an effect by its index and its unknowns as bytes.
 
-        It is kept, because all trials have the same effects, and a derivative by one unknown leaves
-        the other effects as they are. To build it costs as much as to evaluate its law along a
-        trial.
+        The last patches are kept: all trials have the same effects, and a derivative by one unknown
+        leaves the other effects as they are. Building a patch takes as long as evaluating its law
+        along a trial.
         """
         terms = self.candidate.terms
         setting = self.problem.setting
@@ -294,9 +294,9 @@ class EffectLaws:
     def _linearised_sensor_errors(
         self, arguments: LawArguments, linearised_forces: Mapping[int, LinearisedForce]
     ) -> LinearisedSensorErrors:
-        """Return the changes of a trial's readings by errors of sensors, with their derivatives.
+        """Return how errors of sensors change a trial's readings, with the derivatives by unknowns.
 
-        The forces of all laws are given by the number of the port.
+        `linearised_forces` are the forces of all laws, by the number of the port.
         """
         trial = self.trials[arguments.trial_index]
         change = np.zeros_like(trial.residual)
@@ -332,12 +332,11 @@ class EffectLaws:
     def _explained_trajectory(
         self, arguments: LawArguments, forces: Mapping[int, FloatArray]
     ) -> Trajectory:
-        """Return the motion of a trial by the model and the forces of all laws, given by port.
+        """Return the motion of a trial by the model and the forces of all laws.
 
-        It is the motion that errors of sensors act on.
-
-        The motion by missing forces is left out. It is estimated from the readings, so that its
-        product with an error would explain them by themselves.
+        Errors of sensors are computed from this motion. It leaves out the motion by missing forces,
+        which is estimated from the readings: multiplied by an error of a sensor, it would explain
+        the readings by themselves. `forces` are those of all laws, by the number of the port.
         """
         trial = self.trials[arguments.trial_index]
         added_state = np.zeros_like(arguments.trajectory.added_state)

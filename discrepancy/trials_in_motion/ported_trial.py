@@ -41,8 +41,8 @@ def correlated_noise_part(
 ) -> ColouredNoise | None:
     """Return the part of a channel's noise that is correlated in time, or None if it is white.
 
-    The noise is taken as white noise plus an autoregression of first order. The autocovariance of
-    the sum at lags of one and two samples determines both parts.
+    The noise is taken as the sum of white noise and an autoregression of first order. The
+    autocovariances of the sum at lags of 0, 1 and 2 samples determine both.
 
     Parameters
     ----------
@@ -65,7 +65,8 @@ def correlated_noise_part(
     ]
     if not 0.0 < autocovariances[2] < autocovariances[1]:
         return None
-    # for a first-order autoregression plus white noise, c_1 = share c_0 decay and c_2 = c_1 decay
+    # c_1 = share c_0 decay and c_2 = c_1 decay, where `share` is the fraction of the variance c_0
+    # that is correlated, and `decay` the correlation of its successive samples
     decay = autocovariances[2] / autocovariances[1]
     share = autocovariances[1] / decay / autocovariances[0]
     return ColouredNoise(
@@ -126,10 +127,10 @@ def ported_trial(problem: Problem, trial_index: int, point: Point) -> PortedTria
 
 
 def thinning_stride(trial: PortedTrial, wanted_stride: float) -> int:
-    """Return the stride with which a trial may be thinned, as close to a wanted stride as possible.
+    """Return the stride with which a trial is thinned, at most the wanted one.
 
-    The phase of the fastest mode, and that of the motion of each port, changes by at most
-    `LARGEST_SUBSTEP_PHASE` in a substep of the thinned trial. A trial with uneven intervals is not
+    In a substep of the thinned trial, the phase of the fastest mode and that of the motion of each
+    port must change by at most `LARGEST_SUBSTEP_PHASE`. A trial with uneven intervals is not
     thinned.
 
     Parameters
@@ -154,7 +155,7 @@ def thinning_stride(trial: PortedTrial, wanted_stride: float) -> int:
     largest_phase = LARGEST_SUBSTEP_PHASE * max(trial.substeps, FEWEST_SUBSTEPS)
     longest_stride = largest_phase / max(phase_of_modes, phase_of_motion, LEAST_DIVISOR)
     stride = int(min(wanted_stride, longest_stride, len(trial.time) / FEWEST_SAMPLES))
-    # the substeps of a thinned trial end at fine stamps of the trial
+    # a substep of the thinned trial must consist of whole substeps of the trial
     multiple = FEWEST_SUBSTEPS // trial.substeps if trial.substeps < FEWEST_SUBSTEPS else 1
     return max(1, stride - stride % multiple)
 
@@ -168,7 +169,7 @@ def thin_trial(trial: PortedTrial, wanted_stride: float) -> PortedTrial:
 
 
 def _residual_and_derivatives(
-    problem: Problem, trial_index: int, point: Point
+    problem: Problem, trial_index: int, unknowns: Point
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return the residuals at zero unknowns, and the derivatives of the readings.
 
@@ -178,8 +179,8 @@ def _residual_and_derivatives(
         The campaign and the model, with the layout of their unknowns.
     trial_index : int
         The index of the trial in the problem.
-    point : Point
-        The values u_0 of the unknowns about which the model is linear.
+    unknowns : Point
+        The values u_0 of the unknowns about which the model is linearised.
 
     Returns
     -------
@@ -190,17 +191,19 @@ def _residual_and_derivatives(
         The derivatives D of the prediction by the shared unknowns, and by those of the trial alone.
     """
     data = problem.trials[trial_index]
-    linear_response = problem.linearise(trial_index, point, Candidate())
+    linear_response = problem.linearise(trial_index, unknowns, Candidate())
     derivatives, shared_of_column = problem.prediction_derivatives(
-        trial_index, point, linear_response, Candidate()
+        trial_index, unknowns, linear_response, Candidate()
     )
     by_local = derivatives[: data.unknowns.unknown_count]
     by_shared = np.zeros((problem.shared.unknown_count, *linear_response.response.shape))
     by_shared[shared_of_column] = derivatives[data.unknowns.unknown_count :]
-    residual = data.trial.values - problem.prediction(trial_index, point, linear_response.response)
+    residual = data.trial.values - problem.prediction(
+        trial_index, unknowns, linear_response.response
+    )
     # the linear prediction is p(u_0) + D (u - u_0); at u = 0 it is p(u_0) - D u_0
-    residual += np.tensordot(point.shared, by_shared, 1) + np.tensordot(
-        point.local[trial_index], by_local, 1
+    residual += np.tensordot(unknowns.shared, by_shared, 1) + np.tensordot(
+        unknowns.local[trial_index], by_local, 1
     )
     return residual, by_shared, by_local
 
@@ -241,9 +244,9 @@ def _coloured_noises(noises: Sequence[NoiseModel], interval: float | None) -> li
 def _substep_count(system: PortedSystem, time: FloatArray) -> int:
     """Return the number of substeps in an interval between two samples.
 
-    The phase of the fastest mode changes by at most `LARGEST_SUBSTEP_PHASE` in a substep, if that
-    needs no more than `MOST_SUBSTEPS`; the number is at least `FEWEST_SUBSTEPS`, in long records
-    fewer.
+    The phase of the fastest mode may change by at most `LARGEST_SUBSTEP_PHASE` in a substep. The
+    number is at most `MOST_SUBSTEPS`, and at least `FEWEST_SUBSTEPS`, or
+    `FEWEST_SUBSTEPS_OF_LONG_RECORD` for a record of more than `LONG_RECORD` samples.
     """
     interval = float(np.median(np.diff(time)))
     fastest_angular_frequency = float(
@@ -312,10 +315,10 @@ def _with_gains(system: PortedSystem, gains: FloatArray) -> PortedSystem:
 def _ported_system(
     problem: Problem, trial: Trial, shared_values: FloatArray
 ) -> tuple[PortedSystem, list[PortedSystem | None]]:
-    """Return the linear system with ports of a trial, and its derivatives by the shared unknowns.
+    """Return the linear system of a trial with its ports, and its derivatives by shared unknowns.
 
-    A port is a place of the structure where a force may act. A derivative is None if it is zero.
-    The last unknowns are gains of channels, which do not change the system.
+    A port is a place of the structure where a force may act. A derivative that is zero is None; so
+    are those by the last unknowns, the gains of channels, which do not change the system.
 
     Parameters
     ----------

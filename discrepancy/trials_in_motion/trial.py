@@ -177,8 +177,9 @@ class PortedTrial:
         stride : int
             The number of samples from one that remains to the next.
         substeps : int
-            The number of substeps in an interval of the thinned trial. It divides `stride` times
-            the number of substeps of this trial, as the fine stamps are some of this trial's.
+            The number of substeps in an interval of the thinned trial. It must divide `stride`
+            times the number of substeps of this trial, so that each fine stamp is one of this
+            trial.
         """
         time = self.time[::stride]
         stamp_count = (len(time) - 1) * substeps + 1

@@ -131,7 +131,7 @@ class Factorisation:
         )
 
     def _eliminate(self) -> None:
-        """Factorise front by front, and pass each Schur complement to the parent front."""
+        """Factorise front by front (multifrontal method), adding Schur complements to parents."""
         size = self.stiffness.shape[0]
         position = np.empty(size, dtype=np.int64)
         position[self._order] = np.arange(size)
@@ -183,7 +183,7 @@ class Factorisation:
     def whitened(self, right_hand_side: FloatArray) -> FloatArray:
         """Return L^-1 f for loads f (n,) or (n, k), in the order of elimination.
 
-        In these coordinates the length of a load is its dual norm.
+        The matrix is L L'. In these coordinates the length of a load is its dual norm.
         """
         ordered_loads = right_hand_side[self._order]
         solution = np.array(ordered_loads, dtype=np.float64, order="C")
@@ -260,10 +260,11 @@ class Factorisation:
 def _assembled_pivot_rows(
     front: Front, rows: sparse.csr_array, columns: IntArray, row_in_front: IntArray
 ) -> FloatArray:
-    """Return the rows (p, p + b) of a front's pivots, from the diagonal to the right.
+    """Assemble the rows (p, p + b) of a front's p pivots, from the diagonal to the right.
 
-    The rows of the matrix (n, n) are in the order of elimination; `columns` (nnz,) are the
-    positions of its columns, and `row_in_front` (n,) the indices of positions in the front.
+    The front has b further rows, its boundary. `rows` is the matrix (n, n) with its rows in the
+    order of elimination. `columns` (nnz,) has the position of each entry's column in this order,
+    and `row_in_front` (n,) the row of the front at each position.
     """
     pivots = front.end - front.start
     pivot_rows = np.zeros((pivots, pivots + len(front.boundary)))
@@ -337,7 +338,11 @@ def _extend_add(
     contribution: _SchurComplement,
     row_in_front: IntArray,
 ) -> None:
-    """Add a Schur complement to the pivot rows (p, p + b) and the remaining block (b, b)."""
+    """Add the Schur complement of a child front to the arrays of its parent ("extend-add").
+
+    These are the pivot rows (p, p + b) and the remaining block (b, b), changed in place.
+    `row_in_front` (n,) has the row of the parent front at each position of the elimination order.
+    """
     pivots = len(pivot_rows)
     index = row_in_front[contribution.boundary]
     split = int(np.searchsorted(index, pivots))

@@ -52,9 +52,9 @@ LEAST_SINGULAR_VALUE = 1e-7
 def fewest_directions(
     snapshots: FloatArray, least: int, is_accurate: Callable[[FloatArray], bool]
 ) -> FloatArray:
-    """Return the fewest leading singular directions of snapshots that are accurate.
+    """Return as few leading singular directions of snapshots as are accurate.
 
-    The search bisects, so accuracy has to improve with the number of directions.
+    The number is found by bisection, which assumes that accuracy improves with it.
 
     Parameters
     ----------
@@ -72,14 +72,14 @@ def fewest_directions(
     """
     unit_snapshots = snapshots / np.linalg.norm(snapshots, axis=0)
     directions, singular_values, _ = np.linalg.svd(unit_snapshots, full_matrices=False)
-    most = int(np.sum(singular_values > LEAST_SINGULAR_VALUE * singular_values[0]))
-    number = bisect_left(
-        range(most),
+    most_directions = int(np.sum(singular_values > LEAST_SINGULAR_VALUE * singular_values[0]))
+    direction_count = bisect_left(
+        range(most_directions),
         True,
-        min(least, most),
+        min(least, most_directions),
         key=lambda count: is_accurate(directions[:, :count]),
     )
-    return np.asarray(directions[:, :number])
+    return np.asarray(directions[:, :direction_count])
 
 
 class _ResidualFactors(NamedTuple):
@@ -184,7 +184,10 @@ class StaticReduction:
         )
 
     def _extend_residuals(self, images: FloatArray) -> None:
-        """Add the images (T, n, new) of new basis vectors to the basis of residuals."""
+        """Extend the basis of residuals by the images of new basis vectors.
+
+        `images` (T, n, new) are the T stiffness terms times the new vectors.
+        """
         previous_size = self.residuals.vectors.shape[1]
         whitened = self.terms.factors.whitened(np.concatenate(images, axis=1))
         coordinates = self.residuals.extend(whitened)
@@ -254,12 +257,12 @@ class StaticReduction:
         )
 
     def _residual_factors(self, directions: FloatArray) -> _ResidualFactors:
-        """Return the loads and stiffness terms that form the residuals, in few coordinates.
+        """Return the loads, and the stiffness terms times the basis, in few coordinates.
 
         A residual of the reduced model is the load minus the stiffness times the displacement. All
         residuals lie in the span of the loads and of the images of the basis under the stiffness
-        terms; the factors are coordinates in an orthonormal basis of this span. The reduced model
-        uses the combinations `directions` (N, K) of the basis vectors.
+        terms; the result has coordinates in an orthonormal basis of this span. The basis of the
+        reduced model consists of the combinations `directions` (N, K) of the basis vectors.
         """
         # Images of the K basis vectors under each term of the stiffness
         images = self.residual_stiffness @ directions
@@ -356,7 +359,7 @@ class StaticReduction:
         states = self.terms.training_states()
         points = np.array(states)
         target = SEARCH_MARGIN * settings.bound_tolerance
-        latest = np.full(len(states), np.inf)
+        latest_bounds = np.full(len(states), np.inf)
         history: list[float] = []
         next_states = [_most_central(states)]
         rounds = 1 + ceil((settings.most_snapshots - 1) / STATES_PER_ROUND)
@@ -366,7 +369,7 @@ class StaticReduction:
             remaining = settings.most_snapshots - len(self.snapshots)
             is_last = not (has_grown and remaining)
             inspect_all = is_last or not history
-            bounds = self._training_bounds(states, latest, target, inspect_all=inspect_all)
+            bounds = self._training_bounds(states, latest_bounds, target, inspect_all=inspect_all)
             largest_bound = float(bounds.max())
             history.append(largest_bound)
             if is_last or largest_bound <= target:
@@ -379,10 +382,11 @@ class StaticReduction:
     def _training_bounds(
         self, states: list[State], latest: FloatArray, target: float, *, inspect_all: bool
     ) -> FloatArray:
-        """Return the bounds (B,) of the present model; zero for states not evaluated.
+        """Return the error bounds (B,) of the present model in the training states.
 
-        States are evaluated in the order of their `latest` bounds (B,), which are updated. Unless
-        `inspect_all` is set, the evaluation may stop once a bound exceeds `target`.
+        The states with the largest `latest` bounds (B,), which are updated, are evaluated first.
+        Unless `inspect_all` is set, only one of `INSPECTED_ONE_OF` states is evaluated if one of
+        these bounds exceeds `target`; the bound of states that are not evaluated is zero.
         """
         model = self.model()
         bounds = np.zeros(len(states))
@@ -434,8 +438,9 @@ def _most_central(states: list[State]) -> State:
 def _next_states(states: FloatArray, bounds: FloatArray, count: int, least: float) -> list[State]:
     """Choose the states of the next full solutions: with large bounds, and far from each other.
 
-    The first is the state with the largest bound. Each further state has the largest product of its
-    bound and its distance from the nearest chosen state, and a bound above `least`.
+    The first is the state with the largest bound. Each further state is the one with the largest
+    product of its bound and its distance from the nearest chosen state, among those with a bound
+    above `least`.
 
     Parameters
     ----------

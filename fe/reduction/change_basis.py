@@ -142,20 +142,24 @@ class _Columns:
         return self.factors.whitened(self.factors.stiffness @ displacements)
 
     def add_motion(self, motion: SupportMotion) -> None:
-        """Add the columns of a support motion: unit responses, and responses to their inertia."""
+        """Add the columns of a support motion: its unit response, and responses to their inertia.
+
+        The unit response is the displacement if the support moves by one; it also is added as it
+        changes with the parameters.
+        """
         number = 1 + self.structure.support_motions.index(motion)
         is_held = motion.spring == 0.0
         unit_response = self._unit_responses(motion, self.held_terms.reference[np.newaxis])
-        others = self._unit_responses(motion, self._other_states()) - unit_response
+        changes_of_response = self._unit_responses(motion, self._other_states()) - unit_response
         # the displacements of all unknowns when the support moves
-        whole = np.zeros((self.structure.unknowns, 1))
-        whole[: self.free] = unit_response
+        unit_displacement = np.zeros((self.structure.unknowns, 1))
+        unit_displacement[: self.free] = unit_response
         if is_held:
-            whole[motion.unknown] = 1.0
-            self.blocks.append(whole)
+            unit_displacement[motion.unknown] = 1.0
+            self.blocks.append(unit_displacement)
             self.owners.append(np.array([number], dtype=np.int64))
         snapshots = [] if is_held else [unit_response]
-        inertia_force = (self.mass @ whole)[: self.free]
+        inertia_force = (self.mass @ unit_displacement)[: self.free]
         free_mass = self.mass[: self.free, : self.free]
         for _ in range(INERTIA_RESPONSES):
             snapshots.append(self.factors.riesz(inertia_force))
@@ -164,7 +168,7 @@ class _Columns:
         directions = [vector / np.linalg.norm(vector) for vector in directions]
         # a change of the unit response is relative to the unit response
         scale = np.linalg.norm(self._whitened(unit_response))
-        block = np.concatenate((*directions, self._whitened(others) / scale), axis=1)
+        block = np.concatenate((*directions, self._whitened(changes_of_response) / scale), axis=1)
         self._add_remainders(number, block)
 
     def refine(self, model: ChangeableModel, number: int) -> None:
@@ -184,23 +188,23 @@ class _Columns:
     def _add_remainders(
         self, number: int, block: FloatArray, least: float = LEAST_REMAINDER
     ) -> None:
-        """Add the components of whitened vectors (n, k) outside a change's columns to these.
+        """Add to a change's columns what whitened vectors (n, k) contain beyond these columns.
 
-        Directions with a norm below `least` are left out.
+        Directions with a norm below `least` are left out. `number` is that of the change, from 1.
         """
         own_basis = OrthonormalBasis(self.free, drop=SAME_DIRECTION)
         own_basis.vectors = self.base.vectors
-        for owned, owner in zip(self.blocks, self.owners, strict=True):
-            free_part = owned[: self.free]
-            is_lift = owned[self.free :].any()
-            if owner[:1].tolist() == [number] and not is_lift and owned.shape[1]:
+        for columns_of_change, owner in zip(self.blocks, self.owners, strict=True):
+            free_part = columns_of_change[: self.free]
+            is_lift = columns_of_change[self.free :].any()
+            if owner[:1].tolist() == [number] and not is_lift and columns_of_change.shape[1]:
                 own_basis.extend(self._whitened(free_part))
         for _ in range(2):
             block = block - own_basis.vectors @ (own_basis.vectors.T @ block)
         # singular directions by the method of snapshots
-        squares, vectors = np.linalg.eigh(block.T @ block)
-        is_kept = squares > least**2
-        directions = block @ (vectors[:, is_kept] / np.sqrt(squares[is_kept]))
+        eigenvalues, eigenvectors = np.linalg.eigh(block.T @ block)
+        is_kept = eigenvalues > least**2
+        directions = block @ (eigenvectors[:, is_kept] / np.sqrt(eigenvalues[is_kept]))
         columns = self.factors.unwhitened(directions)
         self.blocks.append(np.pad(columns, ((0, self.structure.unknowns - self.free), (0, 0))))
         self.owners.append(np.full(columns.shape[1], number, dtype=np.int64))
@@ -218,7 +222,11 @@ class _Columns:
         return np.array([self.held_terms.theta(state) for state in states])
 
     def _unit_responses(self, motion: SupportMotion, thetas: FloatArray) -> FloatArray:
-        """Return displacements (n, B) per unit motion, or force against a spring, in B states."""
+        """Return the displacements (n, B) by a unit motion of a support, in B states.
+
+        A support on a spring gets a unit force instead. `thetas` (B, T) are the coefficients of the
+        T stiffness terms in each state.
+        """
         if motion.spring > 0.0:
             unit_force = np.zeros((self.free, 1))
             unit_force[motion.unknown] = 1.0
@@ -279,20 +287,25 @@ class _Columns:
         return [candidate.name for candidate in self.mass_places].index(place.name)
 
     def add_loss(self, patch: LossCandidate) -> None:
-        """Add the columns of a loss of stiffness: the changes of solutions and modes."""
+        """Add the columns of a loss of stiffness: the changes that it makes of solutions and modes.
+
+        They are the derivative for a small loss, and the differences for some large losses.
+        """
         number = self._first_loss + self.loss_places.index(patch)
         forces = self._forces_of_snapshots
         snapshots = self.factors.riesz(forces)
-        held = {term: matrix[: self.free, : self.free] for term, matrix in patch.terms.items()}
+        patch_stiffness = {
+            term: matrix[: self.free, : self.free] for term, matrix in patch.terms.items()
+        }
         lost_forces = np.zeros_like(snapshots)
-        for term, matrix in held.items():
+        for term, matrix in patch_stiffness.items():
             lost_forces += self.held_terms.reference[term] * (matrix @ snapshots)
-        of_small_loss = self.factors.riesz(lost_forces)
-        of_large_losses = [
-            self._solution_with_loss(held, loss, forces, start=snapshots) - snapshots
+        changes_by_small_loss = self.factors.riesz(lost_forces)
+        changes_by_large_losses = [
+            self._solution_with_loss(patch_stiffness, loss, forces, start=snapshots) - snapshots
             for loss in LARGE_LOSSES
         ]
-        block = np.concatenate((of_small_loss, *of_large_losses), axis=1)
+        block = np.concatenate((changes_by_small_loss, *changes_by_large_losses), axis=1)
         self._add_remainders(number, self._whitened(block), LEAST_LOSS_REMAINDER)
 
     @cached_property
@@ -353,10 +366,10 @@ class _Columns:
         return vector
 
     def _yielding_case(self, model: ChangeableModel, number: int, gain: float) -> "ChangedCase":
-        """Return the case of a support that yields.
+        """Return the model with a support that yields, beside the full solution of this case.
 
-        `number` counts the support motions; `gain` is the largest relative gain of compliance under
-        a load or in a mode.
+        `number` is the index of the support motion. The added compliance is such that the
+        compliance under a load, or of a mode, grows at most by the fraction `gain`.
         """
         motion = self.structure.support_motions[number]
         reference = self.held_terms.reference
@@ -370,12 +383,18 @@ class _Columns:
         direction[: self.free] = response
         if motion.spring == 0.0:
             direction[motion.unknown] = 1.0
-            image = affine_product(self.terms.stiffness_terms, reference, direction)
-            factor = 1.0 / (1.0 / compliance + float((direction.T @ image).item()))
+            stiffness_times_direction = affine_product(
+                self.terms.stiffness_terms, reference, direction
+            )
+            factor = 1.0 / (
+                1.0 / compliance + float((direction.T @ stiffness_times_direction).item())
+            )
         else:
             spring = float(model.springs_at(vector)[number])
-            change = 1.0 / (1.0 / spring + compliance) - spring
-            factor = -change / (1.0 + change * float(response[motion.unknown, 0]))
+            stiffness_change = 1.0 / (1.0 / spring + compliance) - spring
+            factor = -stiffness_change / (
+                1.0 + stiffness_change * float(response[motion.unknown, 0])
+            )
 
         def full_solution(loads: FloatArray) -> FloatArray:
             return self._held_solution(loads) + factor * direction @ (direction.T @ loads)
@@ -392,23 +411,28 @@ class _Columns:
     def _case_with_mass(
         self, model: ChangeableModel, number: int, distance: float
     ) -> "ChangedCase":
-        """Return the case of a point mass, at a distance along and across over the reach."""
+        """Return the model with a point mass, beside the full solution of this case.
+
+        The mass lies beside the place, by `distance` times its reach along both axes.
+        """
         place = self.mass_places[number]
-        beside = distance * place.reach
+        offset = distance * place.reach
         vector = self._middle_vector(model)
         unchanged = ChangedStructure(model, vector, ModelPatch())
         shapes = unchanged.basis @ unchanged.mode_shapes
-        largest = float(np.sum((model.mass_rows[number] @ shapes) ** 2, axis=0).max())
-        primitive = PlaceMass(place.name, LARGEST_MASS_GAIN / largest, beside, beside)
+        largest_square = float(np.sum((model.mass_rows[number] @ shapes) ** 2, axis=0).max())
+        primitive = PlaceMass(place.name, LARGEST_MASS_GAIN / largest_square, offset, offset)
         structure = ChangedStructure(model, vector, ModelPatch((primitive,)))
-        rows = place.rows_beside(beside, beside)
+        rows = place.rows_beside(offset, offset)
         mass = (self.mass + primitive.mass * (rows.T @ rows)).tocsr()
         return ChangedCase(structure, self._held_solution, mass)
 
     def _case_with_loss(self, model: ChangeableModel, number: int, loss: float) -> "ChangedCase":
-        """Return the case of a loss of stiffness."""
+        """Return the model with a loss of stiffness, beside the full solution of this case."""
         patch = self.loss_places[number]
-        held = {term: matrix[: self.free, : self.free] for term, matrix in patch.terms.items()}
+        patch_stiffness = {
+            term: matrix[: self.free, : self.free] for term, matrix in patch.terms.items()
+        }
         primitive = RegionStiffnessLoss(patch.name, loss)
         vector = self._middle_vector(model)
         structure = ChangedStructure(model, vector, ModelPatch((primitive,)))
@@ -418,7 +442,7 @@ class _Columns:
         def full_solution(loads: FloatArray) -> FloatArray:
             solution = basis @ structure.static(basis.T @ loads)
             solution[: self.free] = self._solution_with_loss(
-                held,
+                patch_stiffness,
                 loss,
                 loads[: self.free],
                 start=solution[: self.free],

@@ -88,7 +88,7 @@ PROBABILITIES = _ChangeProbabilities()
 
 
 def reduce_patches(operators: AffineOperators, progress: Progress | None = None) -> PatchArrays:
-    """Make the arrays of a wing that can be patched.
+    """Reduce a wing to the arrays from which it is solved with changes (patches) of its structure.
 
     Raises
     ------
@@ -125,10 +125,9 @@ def _snapshots(full_model: PatchOperators, loss: float) -> FloatArray:
 
     The columns are:
 
-    1. the solutions under the loads of `_snapshot_loads`, each of unit energy norm;
-    2. the lowest modes, also of unit energy norm: that of a mode is its angular frequency;
-    3. the solutions under the elastic forces of each part of the skin in all of these, as large as
-       they are.
+    1. the solutions under the loads of `_snapshot_loads`, each scaled to unit energy norm;
+    2. the lowest modes, also of unit energy norm (before scaling, it is the angular frequency);
+    3. the solutions under the elastic forces that each part of the skin has in 1 and 2, not scaled.
     """
     operators = full_model.operators
     health = dict.fromkeys(operators.regions, loss)
@@ -147,9 +146,10 @@ def _snapshots(full_model: PatchOperators, loss: float) -> FloatArray:
 
 
 def _snapshot_loads(full_model: PatchOperators, modes: FloatArray) -> FloatArray:
-    """Return the loads (L, n) of the snapshots: the gauges, tip force and lift, then others.
+    """Return the loads (L, n) of the snapshots: rows of the gauges, tip force, lift, then others.
 
-    `modes` (n, m) are the lowest modes of the model.
+    The row of an output is used as a load, since its solution makes the output accurate. `modes`
+    (n, m) are the lowest modes of the model.
     """
     operators = full_model.operators
     lines = full_model.line_rows
@@ -181,19 +181,20 @@ def _snapshot_loads(full_model: PatchOperators, modes: FloatArray) -> FloatArray
 
 
 def _skin_forces(full_model: PatchOperators, solutions: FloatArray) -> list[FloatArray]:
-    """Return the elastic forces (n, s) of each part of the skin in the snapshot solutions.
+    """Return for each part of the skin its elastic forces (n, s) in some of the snapshot solutions.
 
-    `solutions` (n, S) are those under the loads of `_snapshot_loads`, then the modes.
+    `solutions` (n, S) are those under the loads of `_snapshot_loads`, then the modes. The solutions
+    of a gauge are left out for parts far from it.
     """
     layout = full_model.layout
     gauge_stations = layout["gauge_stations"]
     gauge_count = len(gauge_stations)
     main_loads = 2  # tip force and lift
-    of_gauges, of_main_loads, _ = np.split(
+    gauge_solutions, main_load_solutions, _ = np.split(
         solutions, [gauge_count, gauge_count + main_loads], axis=1
     )
     main_modes = solutions[:, -MODES:][:, :INERTIA_SHAPES]
-    main_solutions = np.concatenate((of_main_loads, main_modes), axis=1)
+    main_solutions = np.concatenate((main_load_solutions, main_modes), axis=1)
     # the solutions of a gauge's loads matter only for changes in strips close to the gauge
     edges = layout["strip_lines"]
     strip_middles = 0.5 * (edges[1:] + edges[:-1])
@@ -203,7 +204,7 @@ def _skin_forces(full_model: PatchOperators, solutions: FloatArray) -> list[Floa
     is_near = distance < NEAR_GAUGE * widest_strip
     forces = []
     for part, near_gauges in zip(full_model.strips, is_near, strict=True):
-        part_solutions = np.concatenate((main_solutions, of_gauges[:, near_gauges]), axis=1)
+        part_solutions = np.concatenate((main_solutions, gauge_solutions[:, near_gauges]), axis=1)
         forces.append(part @ part_solutions)
     return forces
 
@@ -217,7 +218,7 @@ def _projected(matrix: sparse.csr_array, basis: FloatArray) -> FloatArray:
 
 
 def project(full_model: PatchOperators, basis: FloatArray) -> PatchArrays:
-    """Return the arrays of a wing in a basis (n, N)."""
+    """Project the matrices, loads and outputs of a wing on a basis (n, N)."""
     operators = full_model.operators
     stiffness = np.stack([_projected(term.matrix, basis) for term in operators.stiffness_terms])
     mass = np.stack([_projected(term, basis) for term in operators.mass_terms])
@@ -279,10 +280,10 @@ class _SnapshotLoads(NamedTuple):
 
 
 def _kept_directions(arrays: PatchArrays) -> FloatArray:
-    """Return the directions (N, n) of the working basis that are kept.
+    """Choose directions (N, n) of the working basis by proper orthogonal decomposition.
 
-    They are found by proper orthogonal decomposition: the eigenvectors with the largest eigenvalues
-    of the weighted sum of the outer products of all snapshots, in random patched states.
+    They are the eigenvectors with the largest eigenvalues of the weighted sum of the outer products
+    of all snapshots: static solutions and modes of the wing with random changes.
     """
     wing = PatchedWing(arrays)
     loads = _weighted_loads(wing)
@@ -337,7 +338,7 @@ def _unit_columns(vectors: FloatArray) -> FloatArray:
 def _patched_state(
     wing: PatchedWing, fractions: FloatArray, *, unchanged: bool
 ) -> PatchedStructure:
-    """Return a wing whose modulus, damage, masses and patch are given by fractions of their ranges.
+    """Return a wing whose modulus, damage, masses and changes are fractions of their ranges.
 
     Parameters
     ----------

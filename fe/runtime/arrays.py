@@ -175,7 +175,8 @@ class StoredArrays:
     ) -> None:
         """Raise `ReducedModelFileError` unless an array fits its declaration and is finite.
 
-        The lengths of axes that are not known yet are added to `lengths`.
+        `axes` are the declared lengths, or names of lengths that several arrays share. `lengths`
+        has the known lengths by name; those that this array is the first to have are added.
         """
         array = getattr(self, field.name)
         (dtype,) = get_args(get_args(get_args(field.type)[0])[1])

@@ -169,7 +169,7 @@ class ModalSystem:
 
     @cached_property
     def _free_modes(self) -> "_FreeModes | None":
-        """The free motion as damped oscillations, or None if it is inaccurate as such.
+        """The free motion as a sum of damped oscillations, or None if this would be inaccurate.
 
         Close to critical damping the eigenvectors are nearly parallel.
         """

@@ -316,25 +316,25 @@ class ModelPatch:
         return ModelPatch(self.primitives + other.primitives)
 
     def in_trial(self, trial: str) -> "ModelPatch":
-        """Return the part of the patch that acts in the trial with a name.
+        """Return the part of the patch that acts in the trial of this name.
 
-        A primitive keeps only its windows in this trial, and is left out if it has windows in other
-        trials only. It is returned without windows, as it acts always, if it has none or if one of
-        them spans the whole trial.
+        A primitive keeps only its windows in this trial. It is left out if all its windows are in
+        other trials. If it has no windows, or one of them spans the whole trial, it acts always,
+        and is returned without windows.
         """
         if not self.has_windows:
             return self
-        acting: list[Primitive] = []
+        acting_primitives: list[Primitive] = []
         for primitive in self.primitives:
             if not primitive.windows:
-                acting.append(primitive)
+                acting_primitives.append(primitive)
                 continue
             windows = tuple(window for window in primitive.windows if window.trial == trial)
             if not windows:
                 continue
             spans_trial = any(window.begin is None and window.end is None for window in windows)
-            acting.append(replace(primitive, windows=() if spans_trial else windows))
-        return ModelPatch(tuple(acting))
+            acting_primitives.append(replace(primitive, windows=() if spans_trial else windows))
+        return ModelPatch(tuple(acting_primitives))
 
     @property
     def has_windows(self) -> bool:

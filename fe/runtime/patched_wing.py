@@ -75,9 +75,7 @@ def solver_by_inverse(stiffness: FloatArray) -> Solver:
 def motion_basis(
     static: Solver, mass: FloatArray, start: FloatArray, static_shapes: FloatArray
 ) -> FloatArray:
-    """Return an orthonormal basis of the lowest modes and of static shapes.
-
-    The modes are found by subspace iteration.
+    """Return an orthonormal basis of the lowest modes, by subspace iteration, and static shapes.
 
     Parameters
     ----------
@@ -125,7 +123,7 @@ class PatchedWing(WingRows):
     def mass(
         self, servo_mass: float, pitot_mass: float, patch: ModelPatch = NO_PATCH
     ) -> FloatArray:
-        """Return the mass (n, n) [kg].
+        """Return the mass matrix (n, n) [kg] for given masses and a patch.
 
         Parameters
         ----------
@@ -166,7 +164,7 @@ class PatchedWing(WingRows):
         young_modulus_factor, stiffness_loss
             As in `fe.runtime.state.DigitalState`.
         patch : ModelPatch
-            Its root compliances, losses and temperature coefficients act.
+            Its root compliances, losses and temperature coefficients change the stiffness.
         temperature_difference : float
             Temperature minus the reference temperature [K].
 
@@ -194,11 +192,11 @@ class PatchedWing(WingRows):
     def _remaining_in_regions(self, stiffness_loss: Losses, patch: ModelPatch) -> list[float]:
         """Return the fraction of its stiffness that each damage region keeps.
 
-        Losses of the state and of the patch multiply. Raises `InvalidPatchError` if the wing does
-        not have a region of the patch.
+        It is the product of what each loss of the state and of the patch leaves. Raises
+        `InvalidPatchError` if the patch names a region that the wing does not have.
         """
         regions = self.arrays.regions
-        remaining = [1.0 - loss for loss in self.arrays.losses(stiffness_loss)]
+        remaining_fractions = [1.0 - loss for loss in self.arrays.losses(stiffness_loss)]
         for primitive in patch:
             if not isinstance(primitive, RegionStiffnessLoss):
                 continue
@@ -207,8 +205,8 @@ class PatchedWing(WingRows):
                     f"The patch takes stiffness from the damage region {primitive.region!r}, but "
                     f"the wing has {', '.join(regions)}."
                 )
-            remaining[regions.index(primitive.region)] *= 1.0 - primitive.loss
-        return remaining
+            remaining_fractions[regions.index(primitive.region)] *= 1.0 - primitive.loss
+        return remaining_fractions
 
     def _add_root_compliance(self, stiffness: FloatArray, patch: ModelPatch) -> None:
         """Put the root compliances of a patch in series with the root spring, in place.
@@ -240,9 +238,10 @@ class PatchedWing(WingRows):
     def _add_local_losses(
         self, stiffness: FloatArray, patch: ModelPatch, theta: FloatArray
     ) -> None:
-        """Subtract a patch's local losses, averaged over strips, from a stiffness, in place.
+        """Subtract a patch's local losses, averaged over strips, from a stiffness (n, n), in place.
 
-        `theta` (K + 2,) are the coefficients of the stiffness terms.
+        `theta` (K + 2,) are the coefficients of the stiffness terms: of the skin, of K damage
+        regions, and of the rest.
         """
         arrays = self.arrays
         skin = remaining_skin(patch, arrays.strip_lines)

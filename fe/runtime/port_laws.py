@@ -217,7 +217,7 @@ NO_LAWS = PortLaws((), np.zeros(0, dtype=np.int64), np.zeros((0, PARAMETERS)))
 
 
 def port_laws(patch: ModelPatch, ports: Collection[str], *, in_windows: bool = False) -> PortLaws:
-    """Return the internal forces of a patch; laws without magnitude are left out.
+    """Collect the internal forces of a patch; laws of zero magnitude are left out.
 
     Parameters
     ----------
@@ -252,12 +252,12 @@ def port_laws(patch: ModelPatch, ports: Collection[str], *, in_windows: bool = F
         return replace(NO_LAWS, stiffness_rate=stiffness_rate) if stiffness_rate else NO_LAWS
     # pad the parameters of all laws to one length
     rows = [law.parameter_row for law in forces]
-    longest = max(map(len, rows))
+    longest_length = max(map(len, rows))
     spans = tuple(tuple(window.span for window in law.windows) for law in forces)
     return PortLaws(
         ports=tuple(law.port for law in forces),
         law_numbers=np.array([LAWS.index(type(law)) for law in forces], dtype=np.int64),
-        parameters=np.array([np.pad(row, (0, longest - len(row))) for row in rows]),
+        parameters=np.array([np.pad(row, (0, longest_length - len(row))) for row in rows]),
         stiffness_rate=stiffness_rate,
         active_spans=spans if any(spans) else (),
     )
@@ -281,9 +281,9 @@ on the modes, else on the residual flexibility."""
 
 
 def port_flexibility(system: ModalSystem, laws: PortLaws) -> FloatArray:
-    """Return the residual flexibility (J,) of the laws' ports.
+    """Return the residual flexibility (J,) of the port of each law: that of modes without inertia.
 
-    It is set to zero for a law of speed at a port whose flexibility is nearly all in the modes: the
+    It is set to zero for a law of speed at a port whose flexibility is nearly all in the modes. The
     law then acts on the modes themselves, which needs no small time steps.
     """
     flexibility = np.zeros(len(laws))

@@ -184,7 +184,7 @@ class ModalIntegrator:
     def state_after_release(
         self, offset: float, load: npt.ArrayLike, holding_load: int
     ) -> TransientState:
-        """Return the state just after the release of a structure that a force held displaced.
+        """Return the state just after the release of a structure that a force has held displaced.
 
         Parameters
         ----------
@@ -224,25 +224,26 @@ class ModalIntegrator:
     ) -> tuple[TransientState, float]:
         """Return the equilibrium of a structure that a force holds displaced, and the force [N].
 
-        The point is held at the displacement that the given force would cause without laws. The
-        laws change the force that is needed for this displacement. With the forces F of the laws,
-        the compliance C of the ports, the response a of the ports to a unit force at the point, and
-        the response a_0 of the point itself, the ports are at x = x_linear - (C - a a^T / a_0) F.
+        The point is held at the displacement that the given force would cause without laws; the
+        laws change the force that this needs. With the forces F of the laws, the compliance C of
+        the ports, the response a of the ports to a unit force at the point, and the response a_0 of
+        the point itself, the positions of the ports are x = x_linear - (C - a a^T / a_0) F.
         """
         response = self.structure.unit_responses[:, holding_load]
-        ports = self._responses.port_positions[:, holding_load]
-        point = self.structure.unit_loads[:, holding_load] @ response
+        port_response = self._responses.port_positions[:, holding_load]
+        point_response = self.structure.unit_loads[:, holding_load] @ response
         at_rest = self._responses.port_positions_by_loads @ rest_state.load
         forces_before = rest_state.memory[:, LAGGED_FORCE]
-        start = at_rest - ports / point * (ports @ forces_before)
+        start = at_rest - port_response / point_response * (port_response @ forces_before)
         forces, memory = self._law_forces_at_rest(
-            linear_positions=start + force * ports,
-            compliance=self._responses.port_compliance - np.outer(ports, ports) / point,
+            linear_positions=start + force * port_response,
+            compliance=self._responses.port_compliance
+            - np.outer(port_response, port_response) / point_response,
             memory=rest_state.memory,
             start=start,
         )
-        force += float(ports @ (forces - forces_before) / point)
-        # the part of the ports' positions that fades after the release
+        force += float(port_response @ (forces - forces_before) / point_response)
+        # the part of the ports' positions that decays after the release
         residual = self._responses.residual_displacements[:, holding_load]
         memory[:, FADING_POSITION] = force * (self._responses.law_loads.T @ residual)
         return replace(rest_state, memory=memory), force
@@ -307,7 +308,7 @@ class ModalIntegrator:
     def _motion_with_laws(
         self, state: TransientState, loads: FloatArray, duration: float, time: float
     ) -> "ModalMotion":
-        """Return the motion with laws at both ends of a step under constant loads."""
+        """Integrate the motion with laws over a step under constant loads."""
         from .motion import InitialMotion, integrate_motion
         from .time_steps import loaded_steps, step_boundaries
 
@@ -381,10 +382,10 @@ class ModalIntegrator:
     ) -> TransientState:
         """Project a state of another integrator on the modes of this one, after a change of health.
 
-        Displacement and velocity of the structure stay what they were: they are projected on the
-        new modes with the new mass matrix, exactly in reduced coordinates. What the new modes
-        cannot represent follows the load without delay, as always. The memory of laws is kept if
-        their kinds and ports are the same; other laws start unloaded.
+        Displacement and velocity of the structure stay the same: they are projected on the new
+        modes with the new mass matrix, exactly in reduced coordinates. What the new modes cannot
+        represent follows the load without delay, as always. The memory of laws is kept if their
+        kinds and ports are the same; otherwise the laws start unloaded.
 
         Parameters
         ----------

@@ -100,10 +100,10 @@ class WingRows:
             )
         if y > self.span:
             # The arm continues the straight line through the tip and a point close to it.
-            inboard = _ARM_ROOT * self.span
-            arm = (y - inboard) / (self.span - inboard)
+            inboard_station = _ARM_ROOT * self.span
+            arm = (y - inboard_station) / (self.span - inboard_station)
             at_tip = self._station_weights(self.span)
-            at_inboard = self._station_weights(inboard)
+            at_inboard = self._station_weights(inboard_station)
             return np.asarray(arm * at_tip + (1.0 - arm) * at_inboard)
         # cell c has its ends at the stations 2 c and 2 c + 2
         last_cell = (len(stations) - 3) // 2
@@ -150,10 +150,10 @@ class WingRows:
         # the two lines, from the leading edge to the trailing edge
         chords = self.arrays.line_chord
         order = np.argsort(chords)
-        within = chord if between_lines_at is None else between_lines_at
-        number = int(np.searchsorted(chords[order], within, side="right"))
-        number = min(max(number, 1), len(order) - 1)
-        fore, aft = order[number - 1 : number + 1]
+        chord_in_interval = chord if between_lines_at is None else between_lines_at
+        aft_number = int(np.searchsorted(chords[order], chord_in_interval, side="right"))
+        aft_number = min(max(aft_number, 1), len(order) - 1)
+        fore, aft = order[aft_number - 1 : aft_number + 1]
         # linear between the two lines, or extrapolated beyond them
         fraction = (chord - chords[fore]) / (chords[aft] - chords[fore])
         rows = self.arrays.line_rows[2:]
@@ -212,9 +212,9 @@ class WingRows:
         return arrays.root_chord + taper * y / arrays.semi_span
 
     def manoeuvre_loads(self, patch: ModelPatch = NO_PATCH) -> FloatArray:
-        """Return the loads (2, n) in a turn per unit load factor, and per unit of its square [N].
+        """Return the loads (2, n) in a turn: per unit of the load factor, and of its square [N].
 
-        Washout, relief by weight and point masses of the patch act.
+        Washouts, reliefs by weight and point masses in the patch change the loads.
 
         Raises
         ------
@@ -326,12 +326,12 @@ class WingRows:
     def strain_factors(self, patch: ModelPatch) -> FloatArray | None:
         """Return factors that correct the strains of gauges for local losses within a strip.
 
-        The stiffness of the model averages a local loss over a strip between mesh lines, but a
-        gauge reads the curvature at its own section. If the skin of a section has the fraction s of
-        the bending stiffness, and keeps the fraction r of its own, the strain at a given bending
-        moment is proportional to 1 / (1 - s (1 - r)). The factor of a gauge is the mean of this
-        strain over the gauge with the local losses, divided by the mean with averaged losses. It is
-        one if losses end at the edges of strips.
+        The model averages a local loss over a strip between mesh lines, but a gauge reads the
+        curvature at its own section. If the skin contributes the fraction s of the bending
+        stiffness of a section, and keeps the fraction r of its own stiffness, the strain at a given
+        bending moment is proportional to 1 / (1 - s (1 - r)). The factor of a gauge is the mean of
+        this strain over the length of the gauge with the local losses, divided by the mean with
+        averaged losses. It is one if losses end at the edges of strips.
 
         Returns
         -------

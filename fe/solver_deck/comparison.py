@@ -76,18 +76,23 @@ def compare_with_calculix(
     remarks: list[str],
     tolerance: float,
 ) -> DeckReport:
-    """Compare a structure file with CalculiX in statics and frequencies."""
+    """Compare a structure file with CalculiX: displacements under each load, and frequencies.
+
+    `blocks` are those of the model in the deck; `remarks` are handed on to the report.
+    """
     assembled = assemble_structure(file)
     deviations = {}
     if structure.loads:
         # Our factors come first: they refuse a mechanism, on which CalculiX computes nonsense.
         responses = static_responses(assembled)
         printed = jobs.displacements(structure.loads, blocks)
-        for load, theirs in zip(structure.loads, printed, strict=True):
-            ours = assembled.full_displacement(responses[load.name].displacement)
+        for load, calculix_displacement in zip(structure.loads, printed, strict=True):
+            displacement = assembled.full_displacement(responses[load.name].displacement)
             scale = UNITS[structure.length_unit]
             largest = float(np.abs(responses[load.name].displacement).max()) / scale
-            deviations[load.name] = _largest_deviation(structure, ours / scale, theirs, largest)
+            deviations[load.name] = _largest_deviation(
+                structure, displacement / scale, calculix_displacement, largest
+            )
     frequencies = np.empty(0)
     frequency_deviation = 0.0
     if assembled.unknowns >= _UNKNOWNS_PER_MODE:
@@ -125,26 +130,29 @@ def _limit(model: LinearModel, load: DeckLoad, tolerance: float) -> float:
 
 def _largest_deviation(
     structure: DeckStructure,
-    ours: FloatArray,
-    theirs: dict[int, FloatArray],
+    displacements: FloatArray,
+    calculix_displacements: dict[int, FloatArray],
     largest_of_rows: float,
 ) -> float:
-    """Return the largest difference of a nodal displacement, relative to the largest displacement.
+    """Return the largest difference to a displacement of CalculiX, over the largest displacement.
 
-    The largest displacement is that of any node, or of any row: under torsion of a straight beam
-    only the nodes of its section move.
+    The largest displacement is that of any node in CalculiX, or `largest_of_rows`, that of any row
+    of the matrices: under torsion of a straight beam only the nodes of its expanded section move.
+    `displacements` are (nodes, 3 or more), in the order of the node numbers.
     """
     counts = structure.row_counts()
     held = set(structure.model.held)
     nodes = sorted({node for node, _ in structure.matrices.dofs})
     differences = [0.0]
-    largest_of_nodes = max(float(np.abs(row).max()) for row in theirs.values())
+    largest_of_nodes = max(float(np.abs(row).max()) for row in calculix_displacements.values())
     largest = max(largest_of_rows, largest_of_nodes)
-    for node, displacement in zip(nodes, ours, strict=True):
+    for node, displacement in zip(nodes, displacements, strict=True):
         for axis in TRANSLATIONS:
             is_read = counts.get((node, axis)) in READ_WEIGHTS
-            if node in theirs and is_read and HeldMotion(node, axis) not in held:
-                differences.append(abs(float(displacement[axis - 1] - theirs[node][axis - 1])))
+            if node in calculix_displacements and is_read and HeldMotion(node, axis) not in held:
+                differences.append(
+                    abs(float(displacement[axis - 1] - calculix_displacements[node][axis - 1]))
+                )
     return max(differences) / largest if largest > 0.0 else 0.0
 
 

@@ -283,7 +283,11 @@ def read_linear_model(
 def _unloaded_blocks(
     before_steps: list[KeywordBlock], contact: ContactChoice
 ) -> list[KeywordBlock]:
-    """Return the blocks of the linear model at rest."""
+    """Return the blocks of a deck that describe the linear model without loads.
+
+    `before_steps` are the blocks before the first step; `contact` says whether contact pairs are
+    tied or left out.
+    """
     blocks: list[KeywordBlock] = []
     for block in before_steps:
         if block.keyword == "CONTACT PAIR" and contact == "tied":

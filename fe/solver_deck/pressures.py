@@ -83,7 +83,7 @@ def element_pressure(shells: ShellGeometry, where: str, values: Sequence[str]) -
 
 
 def surface_pressure(shells: ShellGeometry, where: str, values: Sequence[str]) -> FaceForces:
-    """Return the nodal forces of a line of *DSLOAD: a surface, P, and the pressure.
+    """Return the nodal forces of a line of *DSLOAD, which is `SURFACE, P, PRESSURE`.
 
     Raises
     ------
@@ -119,7 +119,10 @@ def surface_nodes(shells: ShellGeometry, name: str, where: str) -> list[int]:
 
 
 def _surface_faces(shells: ShellGeometry, name: str, where: str) -> list[tuple[int, str]]:
-    """Return the faces of a surface: element numbers, each with the label of a pressure."""
+    """Return the faces of a surface, each as an element number with the label of a pressure on it.
+
+    The label is P1 for the first face of an element.
+    """
     surfaces = [
         block
         for block in shells.blocks
@@ -172,11 +175,11 @@ def _loaded_face(element: DeckElement, label: str) -> _LoadedFace:
 def _nodal_forces(
     shells: ShellGeometry, number: int, loaded: _LoadedFace, pressure: float
 ) -> Iterator[tuple[int, FloatArray]]:
-    """Yield the nodes of a face with the force (3,) that the pressure exerts on each.
+    """Yield each node of a face with the force (3,) that a pressure exerts on it.
 
     A shell is treated as the first face of a solid, whose other nodes do not matter. Pressure on
-    the bottom acts along the normal of the shell. Pressure on a solid acts against the outward
-    normal, which for the first face is the same direction.
+    the bottom of a shell acts along its normal, which is the direction of a pressure on that face:
+    against the outward normal of the solid.
     """
     kind = loaded.kind
     face = loaded.face
@@ -205,5 +208,5 @@ def _nodal_forces(
     surface = Surface(np.array([0]), np.array([face]))
     inward = 1.0 if loaded.side is ShellSide.TOP else -1.0
     vectors = inward * pressure * face_areas(solid, surface).vectors
-    for local, node in zip(face_nodes, numbers, strict=True):
-        yield node, vectors[local]
+    for node_in_element, node in zip(face_nodes, numbers, strict=True):
+        yield node, vectors[node_in_element]

@@ -130,20 +130,20 @@ def with_own_materials(model: LinearModel, regions: Sequence[Region]) -> list[Ke
 def with_scaled_modulus(
     blocks: Sequence[KeywordBlock], region_number: int, factor: float
 ) -> list[KeywordBlock]:
-    """Return blocks of `with_own_materials` with the moduli of one region scaled.
+    """Scale the moduli of one region in the blocks of a deck, which `with_own_materials` returns.
 
-    The number of the region counts from 1.
+    `region_number` counts from 1.
     """
-    scaled = []
+    scaled_blocks = []
     material = ""
     for block in blocks:
         if block.keyword == "MATERIAL":
             material = block.required("NAME")
         if block.keyword == "ELASTIC" and material.endswith(f"_UAVR{region_number}"):
-            scaled.append(_with_scaled_constants(block, factor))
+            scaled_blocks.append(_with_scaled_constants(block, factor))
         else:
-            scaled.append(block)
-    return scaled
+            scaled_blocks.append(block)
+    return scaled_blocks
 
 
 def with_densities(model: LinearModel, blocks: Sequence[KeywordBlock]) -> list[KeywordBlock]:
@@ -202,9 +202,9 @@ def _elastic_sets(model: LinearModel) -> dict[str, frozenset[int]]:
 def _with_material_of_region(
     model: LinearModel, blocks: list[KeywordBlock], region: Region, suffix: str
 ) -> list[KeywordBlock]:
-    """Return blocks in which a region has copies of its materials, named with a suffix.
+    """Give the elements of a region copies of their materials, whose names end with a suffix.
 
-    The elements of a section inside the region get the copies; those outside keep the materials.
+    A section that lies partly in the region is split: its elements outside keep the material.
     """
     sets = dict(model.mesh.element_sets)
     sets |= {
@@ -216,17 +216,17 @@ def _with_material_of_region(
     copied: set[str] = set()
     for block in blocks:
         members = sets.get(block.parameters.get("ELSET", "").upper(), [])
-        inside = [number for number in members if number in region.elements]
-        if not is_section(block) or not inside:
+        members_inside = [number for number in members if number in region.elements]
+        if not is_section(block) or not members_inside:
             result.append(block)
             continue
         copied.update(section_materials(block))
         inside_block = _with_materials(block, suffix)
-        outside = [number for number in members if number not in region.elements]
-        if outside:
+        members_outside = [number for number in members if number not in region.elements]
+        if members_outside:
             set_name = block.parameters["ELSET"].upper()
-            result += [_element_set(block, f"{set_name}_IN{suffix}", inside)]
-            result += [_element_set(block, f"{set_name}_EX{suffix}", outside)]
+            result += [_element_set(block, f"{set_name}_IN{suffix}", members_inside)]
+            result += [_element_set(block, f"{set_name}_EX{suffix}", members_outside)]
             inside_block = _with_set(inside_block, f"{set_name}_IN{suffix}")
             result.append(_with_set(block, f"{set_name}_EX{suffix}"))
         result.append(inside_block)

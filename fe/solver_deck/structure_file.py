@@ -122,9 +122,9 @@ def choose_output_sets(model: LinearModel, names: Sequence[str]) -> list[OutputS
 
 
 def movable_output(output: OutputSet, rows: MotionRows, option: str | None) -> OutputSet | None:
-    """Return an output with those of its axes along which its mean displacement is known.
+    """Restrict an output to those of its axes along which its mean displacement is known.
 
-    A set that the user did not name, and that has no such axis, gives None.
+    The result is None for a set that the user did not name and that has no such axis.
 
     Parameters
     ----------
@@ -207,7 +207,11 @@ def _write_load(structure: DeckStructure, load: DeckLoad, folder: Path) -> str:
 
 
 def _output_lines(structure: DeckStructure, output: OutputSet, folder: Path) -> Iterator[str]:
-    """Yield the lines of a set's outputs: mean displacements, and the strain between two nodes."""
+    """Yield the lines of the structure file for a set's outputs, and write their vectors.
+
+    The outputs are the mean displacements of the set along its axes. A set of two nodes also gives
+    the strain between them.
+    """
     name = name_in_file(output.name)[:LARGEST_NAME]
     if not name[0].isalpha():
         name = f"n{name}"[:LARGEST_NAME]
@@ -227,9 +231,10 @@ def _output_lines(structure: DeckStructure, output: OutputSet, folder: Path) -> 
 
 
 def _write_mean(structure: DeckStructure, output: OutputSet, name: str, folder: Path) -> str:
-    """Write the vector of a mean displacement along one axis; return the name of its file.
+    """Write the vector of a set's mean displacement along one axis; return the name of its file.
 
-    A table of nodes is more readable than a vector of all rows, but cannot contain tied nodes.
+    It is written as a table of nodes, which is easy to read. If a node is tied, and so has no row
+    of its own, it is written as a vector of all rows.
     """
     rows = structure.motion_rows
     weight = 1.0 / len(output.nodes)

@@ -214,10 +214,11 @@ def _with_single_spaces(text: str) -> str:
 
 
 def _coordinate_system(block: KeywordBlock) -> CoordinateSystem:
-    """Return the coordinate system that a *SYSTEM defines for the nodes below it.
+    """Return the coordinate system that a *SYSTEM block defines for the nodes after it.
 
-    It gives the origin, a point on x, and a point in the plane of x and y. Without the last point,
-    z stays and x is turned about it; with the origin alone, the axes stay.
+    The block gives up to three points: the origin, a point on the x axis, and a point in the plane
+    of x and y. Without the third point, the z axis is the global one, and x is turned about it;
+    with the origin alone, all axes are the global ones.
     """
     numbers: list[float] = []
     for where, values in block.data:
@@ -241,7 +242,7 @@ def _coordinate_system(block: KeywordBlock) -> CoordinateSystem:
 
 
 def _add_nodes(deck: Deck, block: KeywordBlock, coordinates: CoordinateSystem) -> None:
-    """Add the nodes of a *NODE, converted from the system of the last *SYSTEM."""
+    """Add the nodes of a *NODE block, converted from the coordinates of the last *SYSTEM."""
     kind = block.parameters.get("SYSTEM", "R").upper()
     if kind not in ("R", "C"):
         fail(block.where, f"*NODE with SYSTEM={kind} is not read; give the nodes in SYSTEM=R or C.")
@@ -258,7 +259,7 @@ def _add_nodes(deck: Deck, block: KeywordBlock, coordinates: CoordinateSystem) -
 
 
 def _add_elements(deck: Deck, block: KeywordBlock, types_of_writer: Mapping[str, str]) -> None:
-    """Add the elements of an *ELEMENT; one may take several lines.
+    """Add the elements of an *ELEMENT block, of which each may take several lines.
 
     `types_of_writer` maps type names that the writing program uses to the plain types it means.
     """

@@ -239,7 +239,7 @@ class AffineStructure:
     def load(
         self, name: str, value: float | None = None, masses: Values | None = None
     ) -> FloatArray:
-        """Return a load (n,) [N].
+        """Return the load vector (n,) [N] of a load, at a value of its control.
 
         Parameters
         ----------
@@ -310,7 +310,10 @@ class AffineStructure:
         )
 
     def with_held_supports(self) -> "AffineStructure":
-        """Return the structure with all supports held; itself if no support yields."""
+        """Return the structure with all supports held rigidly; itself if none is released.
+
+        The motions of released supports are the last unknowns, which are left out.
+        """
         released = [motion for motion in self.support_motions if motion.spring == 0.0]
         if not released:
             return self
@@ -340,11 +343,12 @@ class AffineStructure:
 def _values_with_changes(
     nominal_values: dict[str, float], changed_values: Values | None, kind: str
 ) -> dict[str | None, float]:
-    """Return all values by name, nominal unless changed, and 1.0 under the name None.
+    """Return the value of each parameter or free mass: the changed value, or else the nominal one.
 
-    Terms of the stiffness or mass matrix are multiplied by the value that they name; a term that
-    names none has the name None. Raises `InvalidStateError` for a changed value that is not among
-    the nominal ones; the message calls it by `kind`, "parameter" or "free mass".
+    Each term of the stiffness or mass matrix is multiplied by one of these values. The value under
+    the name None is 1, for terms that no parameter multiplies. Raises `InvalidStateError` for a
+    changed value that has no nominal one; the message calls it by `kind`, "parameter" or "free
+    mass".
     """
     changes = dict(changed_values or {})
     unknown_names = set(changes) - set(nominal_values)
@@ -475,19 +479,19 @@ def natural_frequencies(
     SolutionError
         If the structure has no mass, has fewer modes, or the iteration did not converge.
     """
-    most = structure.unknowns - 1
-    if not 1 <= count <= most:
+    most_modes = structure.unknowns - 1
+    if not 1 <= count <= most_modes:
         raise SolutionError(
             f"{count} modes were asked for, but a structure of {structure.unknowns} free unknowns "
-            f"gives 1 to {most}."
+            f"gives 1 to {most_modes}."
         )
     system = structure.system_at(values or {})
     if not system.mass.diagonal().any():
         raise SolutionError(
             "The structure has no mass, hence no modes; give its materials a density."
         )
-    squares, shapes = lowest_eigenpairs(factors or system.stiffness, system.mass, count)
+    eigenvalues, shapes = lowest_eigenpairs(factors or system.stiffness, system.mass, count)
     modal_masses = np.einsum("im,im->m", shapes, system.mass @ shapes)
     return NaturalModes(
-        frequency=np.sqrt(squares) / (2.0 * np.pi), shape=shapes / np.sqrt(modal_masses)
+        frequency=np.sqrt(eigenvalues) / (2.0 * np.pi), shape=shapes / np.sqrt(modal_masses)
     )

@@ -103,10 +103,10 @@ def _not_stated(primitive: Primitive, reason: str) -> InvalidPatchError:
 
 
 def _soften_support(tables: Tables, mesh: StructureMesh, primitive: SupportCompliance) -> None:
-    """Release one motion of a support and give it a spring.
+    """Release one motion of a support and give it a spring, in the tables of a structure file.
 
-    The support becomes a rigid set about its centre if it is none yet. The compliance is added to
-    that of a spring that is there already.
+    If the support is not yet a rigid set, it becomes one about its centre. If the motion has a
+    spring already, the compliances are added.
     """
     rows = [row for row in tables["support"] if row["set"] == primitive.support]
     if len(rows) != 1:
@@ -131,7 +131,7 @@ def _soften_support(tables: Tables, mesh: StructureMesh, primitive: SupportCompl
 
 
 def _add_mass(tables: Tables, mesh: StructureMesh, primitive: PlaceMass) -> None:
-    """Add a point mass at the centre of a set, or at a point."""
+    """Add a point mass at the centre of a set, or at a point, to the tables of a structure file."""
     if primitive.mass <= 0.0:
         raise _not_stated(primitive, f"a mass must be positive, and this one is {primitive.mass:g}")
     place = next(place for place in places_of_mesh(mesh) if place.name == primitive.place)
@@ -153,7 +153,11 @@ def _add_mass(tables: Tables, mesh: StructureMesh, primitive: PlaceMass) -> None
 def _lose_stiffness(
     tables: Tables, design: MeshDesign, mesh: StructureMesh, primitive: RegionStiffnessLoss
 ) -> None:
-    """Take stiffness from the cells of a damage region, a named set or a patch of the search."""
+    """Take stiffness from some cells of a mesh, in the tables of a structure file.
+
+    They are those of a damage region, of a named set, or of a patch of `patches_of_mesh`, for which
+    a set is defined in the file.
+    """
     set_of_region = {region.name: region.set for region in design.damage}
     set_name = set_of_region.get(primitive.region, primitive.region)
     if set_name not in mesh.cell_sets:

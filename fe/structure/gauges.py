@@ -151,8 +151,8 @@ def gauge_rows(
 def gauge_axes(mesh: StructureMesh, gauge: Gauge, where: str) -> tuple[FloatArray, FloatArray]:
     """Return tangential unit vectors (3,) along a gauge and across it.
 
-    The second is the outward normal of the surface times the first. `where` is the name of the
-    gauge, for error messages.
+    The second is the cross product of the outward normal of the surface and the first. `where` is
+    the name of the gauge, for error messages.
 
     Raises
     ------
@@ -173,7 +173,7 @@ def _averaging_points(
     normal: FloatArray,
     where: str,
 ) -> list[SurfacePoint]:
-    """Return the points of the surface over which a gauge averages.
+    """Return the points of the surface over which a gauge averages, on a grid of its area.
 
     `point` is the middle of the gauge [m]; `direction` and `normal` are unit vectors along it and
     out of the surface. Raises `InvalidDesignError` if the gauge reaches over the edge of the
@@ -202,10 +202,10 @@ def _averaging_points(
             )
         return points
 
-    averaged = project_grid(_middles(_POINTS_ALONG), _middles(_POINTS_ACROSS))
+    averaging_points = project_grid(_middles(_POINTS_ALONG), _middles(_POINTS_ACROSS))
     ends = np.array([-0.5, 0.5])
     project_grid(ends, ends)  # refuses corners that lie over the edge
-    return averaged
+    return averaging_points
 
 
 def _middles(count: int) -> FloatArray:

@@ -123,7 +123,7 @@ class _Unknowns(NamedTuple):
 
 
 def _with_held_motions(design: MatrixDesign, files: MatrixFiles, unknowns: _Unknowns) -> _Unknowns:
-    """Append the motions that the supports hold to the unknowns."""
+    """Append the motions that the supports hold to the unknowns, as if the supports were free."""
     columns: dict[tuple[str, str], FloatArray] = {}
     for label, support in design.numbered("support"):
         numbers = sorted(support.nodes)
@@ -137,7 +137,7 @@ def _with_held_motions(design: MatrixDesign, files: MatrixFiles, unknowns: _Unkn
         SupportMotion(name, motion, unknowns.free_count + number, 0.0)
         for number, (name, motion) in enumerate(columns)
     )
-    # a turn is counted in units of length, as all rows are
+    # a rotation is multiplied by the unit of length, because all unknowns are lengths
     blocks = [
         sparse.csr_array(column[:, np.newaxis] * (files.unit if "r" in motion else 1.0))
         for (_, motion), column in columns.items()
@@ -148,8 +148,8 @@ def _with_held_motions(design: MatrixDesign, files: MatrixFiles, unknowns: _Unkn
 def _row_dofs(design: MatrixDesign, folder: Path) -> list[Dof]:
     """Return the node and component of each row of the stiffness matrices.
 
-    They are those of the file of unknowns, or else of the stiffness matrices. Raises `MeshError` if
-    neither names them.
+    The file of unknowns names them, or else the files of the stiffness matrices themselves. Raises
+    `MeshError` if neither does.
     """
     if design.unknowns is not None:
         return read_unknowns(folder / design.unknowns)
@@ -178,8 +178,8 @@ def _free_rows(design: MatrixDesign, files: MatrixFiles, can_move: FloatArray) -
 def _fields(
     design: MatrixDesign, files: MatrixFiles, mass: sparse.csr_array, unknowns: _Unknowns
 ) -> AffineFields:
-    """Return the fields of the affine model; its expansion gives the rows of the matrices."""
-    size = len(files.dofs)
+    """Return the fields of the affine model, whose expansion leads to the rows of the matrices."""
+    row_count = len(files.dofs)
     point_masses = (_point_mass(part, files, label) for label, part in design.numbered("mass"))
     loads = (_load(load, files, label) for label, load in design.numbered("load"))
 
@@ -188,7 +188,7 @@ def _fields(
             _output_row(output, files, f"{label} ({output.name})")
             for label, output in design.numbered(key)
         ]
-        return sparse.csr_array(np.array(rows).reshape(-1, size))
+        return sparse.csr_array(np.array(rows).reshape(-1, row_count))
 
     return affine_fields(
         design,
@@ -316,9 +316,10 @@ def _part_matrix(
 def _free_part(
     whole_stiffness: sparse.csr_array, part: sparse.csr_array, unknowns: _Unknowns, *, refusal: str
 ) -> sparse.csr_array:
-    """Project a part's stiffness (R, R) on the unknowns, without rounding errors of the whole.
+    """Project the stiffness (R, R) of a part on the unknowns.
 
-    Raises `MeshError` with the sentence `refusal` if the part is indefinite.
+    Entries that are rounding errors of the whole stiffness are set to zero. Raises `MeshError` with
+    the sentence `refusal` if the part is indefinite.
     """
     entries = part.tocoo()
     scale = np.sqrt(np.abs(whole_stiffness.diagonal()))
@@ -390,7 +391,10 @@ def _check_rows(dofs: list[Dof], is_faulty: FloatArray, fault: str) -> None:
 
 
 def _refuse_singular(stiffness: sparse.csr_array, dofs: list[Dof]) -> None:
-    """Raise `MeshError` for a stiffness that is indefinite or leaves motions free."""
+    """Raise the `MeshError` for a stiffness that is indefinite or leaves motions free.
+
+    The message counts the free motions and names the degree of freedom that moves most in one.
+    """
     # unit diagonal, lifted so that free motions have the least positive eigenvalues
     scale = sparse.diags_array(1.0 / np.sqrt(stiffness.diagonal()))
     identity = sparse.eye_array(len(dofs))
@@ -403,9 +407,9 @@ def _refuse_singular(stiffness: sparse.csr_array, dofs: list[Dof]) -> None:
     eigenvalues, shapes = lowest_eigenpairs(lifted, identity, count)
     free_count = int((eigenvalues < _INDEFINITE + _FREE).sum())
     lowest_shape = shapes.T[0]
-    largest = int(np.abs(scale @ lowest_shape).argmax())
+    largest_row = int(np.abs(scale @ lowest_shape).argmax())
     raise MeshError(
         f"motions that the stiffness leaves free, or nearly: {free_count or 1}; in one "
-        f"{describe_dof(dofs[largest])} moves most. Hold the structure by [[support]] "
+        f"{describe_dof(dofs[largest_row])} moves most. Hold the structure by [[support]] "
         "in its structure file, or before its matrices are written (in a deck: *BOUNDARY)."
     )

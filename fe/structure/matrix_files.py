@@ -65,7 +65,7 @@ class MatrixFiles:
         return rows
 
     def rows_of(self, dof: Dof, where: str) -> list[int]:
-        """Return the rows of a component of a node.
+        """Return the rows of the matrices for a component of a node.
 
         There may be several: CalculiX expands a node of a shell or a beam into two to eight nodes,
         whose rows have the same node and component. `where` is the key of the design that names the

@@ -143,7 +143,7 @@ def _symmetric_matrix(indices: IntArray, values: FloatArray) -> sparse.csr_array
     shape = (size, size)
     positions = tuple(indices.T)
     matrix = sparse.coo_array((values, positions), shape).tocsr()
-    # a table of one triangle has a mirrored entry for its diagonal entries only
+    # in a table of one triangle, only the entries on the diagonal are mirrored by an entry
     ones = np.ones(len(values))
     pattern = sparse.coo_array((ones, positions), shape).tocsr()
     mirrored_entries = pattern.multiply(pattern.T).tocoo()

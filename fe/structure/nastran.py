@@ -149,10 +149,11 @@ class _GridPoints:
         return system.to_space(card.floats(2, 3))
 
     def _system(self, number: int, where: str, depth: int) -> CoordinateSystem:
-        """Return a coordinate system by its number; resolve it, and those it refers to, if new.
+        """Return the coordinate system of a number, with those it refers to resolved.
 
-        `where` is the file and line that refer to it, for the error message; `depth` is the number
-        of coordinate systems that are being resolved, by which a circular definition is recognised.
+        `where` is the file and line that refer to it, for the error message. `depth` is the number
+        of coordinate systems that are being resolved; if it is large, they refer to each other in a
+        circle.
         """
         if number in self._systems:
             return self._systems[number]
@@ -174,7 +175,7 @@ class _GridPoints:
         else:
             reference = self._system(card.integer(1), card.where, depth + 1)
             points = reference.to_space(np.reshape(card.floats(2, 9), (3, 3)))
-        # so the axes are found in the order z, x, y: x is the second, y the third, z the first
+        # hence the axes are found in the order z, x, y; `order` puts them in the order x, y, z
         axes = axes_by_points(card.where, points, order=(1, 2, 0))
         kind = card.keyword[5]
         self._systems[number] = CoordinateSystem(points[0], axes, kind)
@@ -195,7 +196,7 @@ def _add_element(deck: Deck, card: _Card) -> None:
 
 
 def _solid_element(card: _Card) -> tuple[str, list[int]]:
-    """Return the meshio type of a solid element, and its nodes in meshio's order."""
+    """Return the meshio type of a solid element, and its node numbers in the order of meshio."""
     fields = [card.integer(field) for field in range(2, len(card.fields))]
     nodes = [node for node in fields if node]
     corner_count = _CORNERS_OF_SOLIDS[card.keyword]
@@ -304,10 +305,10 @@ def _bulk_lines(path: Path) -> list[_Line]:
 
 
 def _replicated(line: _Line, lines_above: list[_Line]) -> list[_Line]:
-    """Write out a line of which a field or the head is `=`, which repeats the line above.
+    """Write out a line that repeats the line above, because a field or its head is `=`.
 
-    A field `=` has the value of the line above; at `==` this and all further fields have; `*(i)`
-    adds i to it. A line `=n` repeats the increments of the line above n times.
+    A field `=` has the value of the line above, and so have all fields from `==` on; a field `*(i)`
+    has that value plus i. A line `=n` stands for n lines with the increments of the line above.
     """
     count_text = line.head.lstrip("=").strip("()")
     if not lines_above or (count_text and len(lines_above) < 2):

@@ -76,13 +76,13 @@ def structure_mesh(design: MeshDesign, file: Path) -> StructureMesh:
     cell_sets = dict(mesh.cell_sets)
     tolerance = 1e-9 * mesh.size
     for label, named_set in design.numbered("set"):
-        of_nodes = named_set.of == "nodes"
-        sets = node_sets if of_nodes else cell_sets
+        is_set_of_nodes = named_set.of == "nodes"
+        sets = node_sets if is_set_of_nodes else cell_sets
         if named_set.numbers is not None:
-            numbers = mesh.node_numbers if of_nodes else mesh.cell_numbers
+            numbers = mesh.node_numbers if is_set_of_nodes else mesh.cell_numbers
             sets[named_set.name] = _indices_of(numbers, named_set, f"{file}: {label}")
             continue
-        points = mesh.points if of_nodes else mesh.centres
+        points = mesh.points if is_set_of_nodes else mesh.centres
         low, high = design.unit * np.array(named_set.box)
         is_above_low = (points >= low - tolerance).all(axis=1)
         is_below_high = (points <= high + tolerance).all(axis=1)
@@ -146,7 +146,11 @@ class _StiffnessParts(NamedTuple):
 def _stiffness_parts(
     design: MeshDesign, material_of: IntArray, region_of: IntArray
 ) -> _StiffnessParts:
-    """Return the pairs of parameter and region that occur, from those of each cell."""
+    """Divide the cells into parts of the same stiffness parameter and the same damage region.
+
+    `material_of` and `region_of` (nc,) are the indices of the material and of the region of each
+    cell; the region is -1 for none.
+    """
     parameters: list[str | None] = [parameter.name for parameter in design.parameter]
     parameters.append(None)
     regions: list[str | None] = [region.name for region in design.damage]
@@ -250,17 +254,21 @@ def _body(
     *,
     mass_as_stiffness: bool,
 ) -> Body[StructureMesh]:
-    """Combine mesh, materials, supports and point masses into a body."""
+    """Combine mesh, materials, supports and point masses into a body.
+
+    `material_of` and `region_of` (nc,) are the indices of the material and of the region of each
+    cell. `mass_as_stiffness` integrates the mass by the rule of the stiffness.
+    """
     parts = _stiffness_parts(design, material_of, region_of)
     elasticities = np.array([material.elasticity for material in design.material])
-    remaining = np.ones(len(mesh.cells))
+    remaining_fraction = np.ones(len(mesh.cells))
     for label, loss in design.numbered("stiffness_loss"):
-        remaining[mesh.cells_of(loss.set, label)] *= 1.0 - loss.fraction
+        remaining_fraction[mesh.cells_of(loss.set, label)] *= 1.0 - loss.fraction
     densities = np.array([material.density for material in design.material])
     return Body(
         mesh=mesh,
         supports=supports,
-        elasticity=remaining[:, np.newaxis, np.newaxis] * elasticities[material_of],
+        elasticity=remaining_fraction[:, np.newaxis, np.newaxis] * elasticities[material_of],
         density=densities[material_of],
         part=parts.part_of,
         parts=parts.names,

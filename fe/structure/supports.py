@@ -82,7 +82,7 @@ class Supports(NamedTuple):
 def supports(
     points: FloatArray, is_held: BoolArray, springs: FloatArray, bodies: Iterable[RigidSet]
 ) -> Supports:
-    """Return the free unknowns of a structure with held, sprung and rigid nodes.
+    """Return the free unknowns of a structure with held nodes, nodes on springs and rigid sets.
 
     Parameters
     ----------
@@ -92,6 +92,8 @@ def supports(
         Whether each displacement is held.
     springs : (nodes, 3) array
         Springs to the ground of nodes that belong to no rigid set [N/m].
+    bodies : iterable of RigidSet
+        The rigid sets, each with up to six motions as unknowns.
     """
     is_free = ~is_held
     body_expansions = []
@@ -110,9 +112,9 @@ def supports(
 def _body_expansion(
     points: FloatArray, body: RigidSet, is_moving: BoolArray | None = None
 ) -> sparse.coo_array:
-    """Return the displacements (3 nodes, m) of all nodes by m unit motions of a body.
+    """Return the displacements (3 nodes, m) of all nodes by unit values of m motions of a body.
 
-    The motions are those that are not held, or those that `is_moving` (6,) selects.
+    The motions are those that are not held, or those for which `is_moving` (6,) is true.
     """
     motions = rigid_motions(points[body.nodes], body.point, 2.0)
     moving = sparse.coo_array(motions[:, ~body.held if is_moving is None else is_moving])
@@ -214,25 +216,28 @@ def _scaled_springs(
     held_supports: Supports, nodal: _NodeSupports, bodies: Iterable[RigidSet]
 ) -> dict[str, FloatArray]:
     """Return the springs (n,) on the free unknowns that each parameter scales."""
-    scaled: dict[str, FloatArray] = {}
+    springs_of_parameters: dict[str, FloatArray] = {}
     count = len(held_supports.springs)
     free = held_supports.free_displacements
     for parameter, springs in nodal.scaled_springs.items():
-        scaled[parameter] = np.pad(springs.ravel()[free], (0, count - len(free)))
-    first = len(free)
+        springs_of_parameters[parameter] = np.pad(springs.ravel()[free], (0, count - len(free)))
+    first_of_body = len(free)
     for body in bodies:
         springs = body.springs[~body.held]
         if body.scaled_by is not None:
-            of_parameter = scaled.setdefault(body.scaled_by, np.zeros(count))
-            of_parameter[first : first + len(springs)] += springs
-        first += len(springs)
-    return scaled
+            of_parameter = springs_of_parameters.setdefault(body.scaled_by, np.zeros(count))
+            of_parameter[first_of_body : first_of_body + len(springs)] += springs
+        first_of_body += len(springs)
+    return springs_of_parameters
 
 
 def _sprung_motions(
     sets: Iterable[str], bodies: Iterable[RigidSet], first: int
 ) -> tuple[SupportMotion, ...]:
-    """Return the motions of rigid sets that have springs; `first` is their first unknown."""
+    """Return the motions of rigid sets that have springs.
+
+    `first` is the index of the first unknown of the rigid sets.
+    """
     motions = []
     unknown = first
     for set_name, body in zip(sets, bodies, strict=True):
@@ -249,10 +254,11 @@ def _sprung_motions(
 def _held_motions(
     design: MeshDesign, mesh: StructureMesh
 ) -> Iterator[tuple[tuple[str, str], sparse.coo_array]]:
-    """Yield the set, the motion and the displacements (full, 1) of each motion that a set holds.
+    """Yield each rigid motion that a support holds: the set, the motion, and its displacements.
 
-    Several tables of one set add up. Motions that move none of the held displacements, such as a
-    rotation of collinear nodes about their line, are left out.
+    The displacements of all nodes are a (3 nodes, 1) array, which is zero where the support holds
+    nothing. Several [[support]] tables of one set are taken together. Motions that move none of the
+    held displacements, such as a rotation of collinear nodes about their line, are left out.
     """
     held_of_set: dict[str, BoolArray] = {}
     for label, support in design.numbered("support"):
@@ -269,7 +275,7 @@ def _held_motions(
         lengths = np.linalg.norm(motions, axis=0)
         for number, motion in enumerate(MOTIONS):
             if lengths[number] > _FREE * lengths.max():
-                # a turn by one radian, not by one in units of the size
+                # `rigid_motions` turns by 2 rad m / size; a unit motion turns by 1 rad
                 scale = 1.0 if number < 3 else 0.5 * mesh.size
                 yield (set_name, motion), sparse.coo_array(scale * motions[:, [number]])
 
@@ -277,7 +283,7 @@ def _held_motions(
 def _with_unknown_motions(
     held_supports: Supports, columns: dict[tuple[str, str], sparse.coo_array]
 ) -> Supports:
-    """Append motions of sets, given by their displacements (full, 1), to the unknowns."""
+    """Append motions of sets, given by their displacements (3 nodes, 1), to the unknowns."""
     first = held_supports.expansion.shape[1]
     motions = tuple(
         SupportMotion(set_name, motion, first + number, 0.0)
@@ -350,8 +356,8 @@ def rigid_motions(points: FloatArray, centre: FloatArray, size: float) -> FloatA
     motions = np.zeros((len(points), 3, 6))
     for axis, unit_axis in enumerate(np.eye(3)):
         motions[:, axis, axis] = 1.0
-        turned = np.cross(unit_axis, arm)
-        motions[:, :, 3 + axis] = turned
+        displacement_by_rotation = np.cross(unit_axis, arm)
+        motions[:, :, 3 + axis] = displacement_by_rotation
     return motions.reshape(-1, 6)
 
 
@@ -360,24 +366,24 @@ def _check_rigid_motions(
 ) -> None:
     """Raise `MeshError` if the supports leave a rigid motion free; the message describes it.
 
-    It is found by a singular value decomposition. All resisting displacements count alike, however
-    stiff they are.
+    A free motion is one that moves no displacement which is held or has a spring, however stiff: a
+    singular vector for the singular value zero.
     """
-    # what each rigid motion of the structure does to the displacements that are resisted
+    # each row is a held or sprung displacement by the six rigid motions of the structure
     centre = mesh.points.mean(axis=0)
     motions = rigid_motions(mesh.points, centre, mesh.size)
-    resisted = [motions[nodal.resists.ravel()]]
+    resisted_rows = [motions[nodal.resists.ravel()]]
     for body in bodies:
         # a rigid set shifts with its point, and turns with the structure
         shifts = rigid_motions(body.point[None], centre, mesh.size)
         turns = np.eye(6)[3:]
         body_resists = body.held | (body.springs > 0.0)
-        resisted.append(np.vstack((shifts, turns))[body_resists])
+        resisted_rows.append(np.vstack((shifts, turns))[body_resists])
     # Motions with a singular value of zero are free. Rows of zeros make the decomposition return
     # all six directions.
-    rows = np.vstack((*resisted, np.zeros((6, 6))))
-    _, values, directions = np.linalg.svd(rows, full_matrices=False)
-    free_motions = directions[values <= _FREE * max(float(values[0]), 1e-300)]
+    rows = np.vstack((*resisted_rows, np.zeros((6, 6))))
+    _, singular_values, directions = np.linalg.svd(rows, full_matrices=False)
+    free_motions = directions[singular_values <= _FREE * max(float(singular_values[0]), 1e-300)]
     if len(free_motions):
         raise MeshError(
             f"{mesh.source}: the supports leave {len(free_motions)} of the six rigid motions free, "

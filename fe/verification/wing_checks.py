@@ -81,10 +81,12 @@ def wing_balance(operators: AffineOperators, load_factor: float = 3.0) -> dict[s
     Returns
     -------
     dict of str to Balance
-        "mass": from the mass matrix, and from density times volume. "reaction": the force in the
-        transverse spring of the root, and the net lift. "root moment": the moment in the flap
-        spring, and that of the load about the root. "energy and work": the elastic energy, and half
-        the work of the load.
+        Four balances:
+
+        - "mass": the mass by the mass matrix, and density times volume;
+        - "reaction": the force in the transverse spring of the root, and the net lift;
+        - "root moment": the moment in the flap spring, and that of the load about the root;
+        - "energy and work": the elastic energy, and half the work of the load.
     """
     mesh = operators.wing_mesh
     root = mesh.design.root
@@ -98,17 +100,17 @@ def wing_balance(operators: AffineOperators, load_factor: float = 3.0) -> dict[s
     matrix_mass = motions.heave @ (operators.mass_terms[0] @ motions.heave)
     volume_mass = volume @ operators.body.density
     # forces at the root, from the solution and from the load
-    u = static_response(operators, {"load_factor": load_factor}).displacement
-    root_heave, root_flap, _ = u[-3:]
+    displacement = static_response(operators, {"load_factor": load_factor}).displacement
+    root_heave, root_flap, _ = displacement[-3:]
     load = operators.turn(load_factor)
     reaction = root.transverse_spring * root_heave
     net_lift = lift.force * load_factor / lift.load_factor
     spring_moment = root.flap_spring * root_flap
     load_moment = motions.flap @ load
     # energy of the solution
-    elastic_force = operators.stiffness() @ u
-    energy = 0.5 * u @ elastic_force
-    work = 0.5 * load @ u
+    elastic_force = operators.stiffness() @ displacement
+    energy = 0.5 * displacement @ elastic_force
+    work = 0.5 * load @ displacement
     return {
         "mass": Balance(float(matrix_mass), float(volume_mass), "kg"),
         "reaction": Balance(float(reaction), net_lift, "N"),
@@ -253,9 +255,9 @@ def balance_checks(operators: AffineOperators) -> Iterator[Check]:
 
     First, rigid motions must cause no elastic force. With the stiffness K_0 without the springs of
     the root, and all rigid motions r that the root allows, the value is the largest entry of K_0 r
-    relative to the largest entry of |K| |r|. That is the size of the terms that cancel, and so of
-    their rounding errors. Then come the balances of `wing_balance` at the load factor of the
-    design's lift, each as the relative difference of two sums.
+    over the largest entry of |K| |r|: the magnitude of the terms that cancel, which determines the
+    rounding errors. Then come the balances of `wing_balance` at the load factor of the design's
+    lift, each as the relative difference of two sums.
     """
     motions = np.column_stack(_root_motions(operators))
     stiffness = operators.stiffness()

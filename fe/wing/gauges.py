@@ -27,10 +27,11 @@ class LinePoints(NamedTuple):
 
 
 def averaging_points(middle: float, length: float, lines: FloatArray) -> LinePoints:
-    """Return Gauss points and weights of a mean over a length, for each interval of mesh lines.
+    """Return Gauss points and weights for a mean over a length, which mesh lines divide.
 
-    Strain jumps at the edge of a defect, which is a mesh line. Points that disregard the mesh lines
-    would misjudge how much of a gauge lies beyond the edge.
+    Each interval between mesh lines has Gauss points of its own, because strain jumps at the edge
+    of a defect, which is a mesh line: other points would misjudge how much of a gauge lies beyond
+    the edge.
 
     Parameters
     ----------

@@ -145,13 +145,13 @@ def _interval_of(lines: FloatArray, position: float) -> tuple[int, float]:
 def straight_edged(
     distance_aft: FloatArray, chord: FloatArray, thickness_ratio: float
 ) -> FloatArray:
-    """Return half thicknesses at mesh lines with which straight edges fit the airfoil best.
+    """Return the half thicknesses at mesh lines with which straight edges fit the airfoil best.
 
     Straight edges between points of the airfoil would make the section too thin, the more so the
-    coarser the mesh. Here each line is moved off the airfoil, by offsets that minimise the squared
-    distance between the edges and the airfoil. That keeps the area and, to fourth order, the second
-    moment. Lines that bound a narrow cell, such as a web, get the same offset, so that the skin has
-    no kink there.
+    coarser the mesh is. Therefore each line is moved off the airfoil, by offsets that minimise the
+    squared distance between the edges and the airfoil. This preserves the area and, to fourth
+    order, the second moment of area. Lines that bound a narrow cell, such as a web, get the same
+    offset, so that the skin has no kink there.
 
     Parameters
     ----------
@@ -205,24 +205,31 @@ def _hat_function_gram(width: FloatArray) -> FloatArray:
     return gram
 
 
-def _airfoil_moments(behind: FloatArray, chord: FloatArray, thickness_ratio: float) -> FloatArray:
+def _airfoil_moments(
+    distance_aft: FloatArray, chord: FloatArray, thickness_ratio: float
+) -> FloatArray:
     """Return moments (ny + 1, nx + 1) [m^2] of the gap between the airfoil and straight edges.
 
     The moment of a mesh line is the integral over the chord of the gap times the linear shape
-    function (hat) of the line, by Gauss-Legendre quadrature in each cell. `behind` (nx + 1, ny + 1)
-    is the distance of each line from the leading edge at each station [m], `chord` (ny + 1,) the
-    chord [m].
+    function (hat) of the line, by Gauss-Legendre quadrature in each cell.
+
+    Parameters
+    ----------
+    distance_aft : (nx + 1, ny + 1) array
+        The distance of each line from the leading edge at each station [m].
+    chord : (ny + 1,) array
+        The chord at each station [m].
     """
-    width = np.diff(behind, axis=0)
-    height_on_lines = _half_thickness(behind, chord, thickness_ratio)
-    line_count, station_count = behind.shape
+    width = np.diff(distance_aft, axis=0)
+    height_on_lines = _half_thickness(distance_aft, chord, thickness_ratio)
+    line_count, station_count = distance_aft.shape
     moments = np.zeros((station_count, line_count))
     abscissas, weights = np.polynomial.legendre.leggauss(5)
     for abscissa, weight in zip(abscissas, weights, strict=True):
-        # shape functions of the cell's rear and front line, and the gap there
+        # shape functions of the rear and the front line at this point of each cell, and the gap
         rear = 0.5 * (1.0 + abscissa)
         front = 1.0 - rear
-        position = behind[:-1] + rear * width
+        position = distance_aft[:-1] + rear * width
         height = _half_thickness(position, chord, thickness_ratio)
         gap = height - front * height_on_lines[:-1] - rear * height_on_lines[1:]
         fraction = 0.5 * weight
@@ -243,11 +250,11 @@ def _grid_points(
     planform = design.planform
     thickness_ratio = design.airfoil.thickness_ratio
     chord = planform.chord(across / planform.semi_span)
-    behind = np.array([line.at(chord) for line in along])
-    outer_surface = straight_edged(behind, chord, thickness_ratio)
+    distance_aft = np.array([line.at(chord) for line in along])
+    outer_surface = straight_edged(distance_aft, chord, thickness_ratio)
     # The skin's thickness is measured normal to it, and the grid line is vertical: a slope makes
     # the vertical thickness larger by sqrt(1 + slope^2).
-    slope = four_digit_slope(behind / chord, thickness_ratio)
+    slope = four_digit_slope(distance_aft / chord, thickness_ratio)
     vertical_thickness = design.skin.thickness * np.sqrt(1.0 + slope**2)
     inner_surface = outer_surface - vertical_thickness
     # lower skin, levels between the inner surfaces, upper skin
@@ -256,8 +263,8 @@ def _grid_points(
     inner_levels = inner_surface[..., np.newaxis] * levels
     z = np.concatenate([-upper_surface, inner_levels, upper_surface], axis=2)
     # the straight chord line is the y axis
-    behind_chord_line = behind - planform.straight_chord_line * chord
-    x = behind_chord_line[..., np.newaxis]
+    distance_from_chord_line = distance_aft - planform.straight_chord_line * chord
+    x = distance_from_chord_line[..., np.newaxis]
     y = across[np.newaxis, :, np.newaxis]
     return np.stack(np.broadcast_arrays(x, y, z), axis=-1)
 

@@ -54,10 +54,10 @@ def _filled(
     chords: FloatArray,
     size: float,
 ) -> list[MeshLine]:
-    """Return the required lines, optional ones that have room, and lines between them.
+    """Fill a direction with mesh lines: the required ones, optional ones with room, lines between.
 
-    `chords` (k,) are the chords at which lines are compared [m], and `size` is the largest cell at
-    the first of them [m]. Raises `MeshError` if required lines nearly coincide or cross.
+    Lines are compared at the chords (k,) [m]; `size` is the largest distance of neighbouring lines
+    at the first chord [m]. Raises `MeshError` if required lines nearly coincide or cross.
     """
     lines = _distinct_lines(required, chords)
     for line, room in optional:
@@ -141,9 +141,10 @@ def _lines_beside(design: WingDesign, edges: list[MeshLine]) -> list[OptionalLin
 
 
 def span_lines(design: WingDesign) -> FloatArray:
-    """Return the distances (ny + 1,) [m] of the mesh lines across the span from the root.
+    """Return the distances (ny + 1,) from the root [m] of the mesh lines that cross the span.
 
-    They are rib faces, edges of defects, ends of bands, and lines between.
+    They are the faces of ribs, the edges of defects, the ends of material bands, and lines between
+    these.
 
     Raises
     ------
@@ -205,9 +206,10 @@ def web_faces(design: WingDesign, index: int) -> tuple[MeshLine, MeshLine]:
 
 
 def chord_lines(design: WingDesign) -> tuple[MeshLine, ...]:
-    """Return the nx + 1 mesh lines along the span.
+    """Return the nx + 1 mesh lines that run along the span.
 
-    They are web faces, edges of defects, the leading-edge wall, and lines between.
+    They are the faces of webs, the edges of defects, the leading-edge wall, and lines between
+    these.
 
     Raises
     ------
@@ -236,7 +238,7 @@ def chord_lines(design: WingDesign) -> tuple[MeshLine, ...]:
 
 
 def cells_within(lines: FloatArray, intervals: Iterable[tuple[float, float]]) -> IntArray:
-    """Return the interval (n,) that contains the middle of each cell between lines, -1 for none.
+    """Return for each of n cells between lines the interval that contains its middle, -1 for none.
 
     Parameters
     ----------

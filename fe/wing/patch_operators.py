@@ -154,12 +154,11 @@ def area_weights(stations: FloatArray, root_chord: float, tip_chord: float) -> F
 
 
 def section_lines(design: WingDesign) -> tuple[float, ...]:
-    """Return the chord fractions of the lines that carry the forces on a section.
+    """Return the chord fractions of the lines along the span on which forces act.
 
     The elastic line comes first, then webs in ascending order. A web closer to another line than
     `LEAST_LINE_DISTANCE` is left out, since a moment would need large opposite forces on a short
-    lever. The webs are tried from the elastic line outwards: of two that are close together, the
-    one nearer to the elastic line is kept.
+    lever arm. Of two webs that are close together, the one nearer to the elastic line is kept.
     """
     elastic_line = design.tip_load.chord
     webs = sorted((web.chord for web in design.webs), key=lambda web: abs(web - elastic_line))
@@ -171,7 +170,7 @@ def section_lines(design: WingDesign) -> tuple[float, ...]:
 
 
 def assemble_patch_operators(operators: AffineOperators) -> PatchOperators:
-    """Assemble the operators of a wing for the primitives of patches."""
+    """Assemble the operators that change a wing: rows, loads and stiffness for patches."""
     mesh = operators.wing_mesh
     design = mesh.design
     planform = design.planform
@@ -212,7 +211,10 @@ def assemble_patch_operators(operators: AffineOperators) -> PatchOperators:
 def _line_rows(
     mesh: WingMesh, stations: FloatArray, chords: tuple[float, ...], expansion: sparse.csr_array
 ) -> LineRows:
-    """Return the displacements of the elastic line and of the other lines at stations (P,)."""
+    """Return the rows that give displacements of the elastic line and the other lines.
+
+    Each has a row for each of the stations (P,), and a column for each unknown.
+    """
 
     def rows(chord: float, component: int) -> sparse.csr_array:
         nodal_weights = np.array(
@@ -245,10 +247,11 @@ def _strain_rows(operators: AffineOperators) -> StrainRows:
 def _lift_rows(
     operators: AffineOperators, weight: FloatArray, stations: FloatArray
 ) -> sparse.csr_array:
-    """Return the lift of load factor 1 at each station along the span: (P, n) [N].
+    """Divide the lift at load factor 1 among the stations along the span: (P, n) [N].
 
-    The force at each node is assigned to the nearest station; the rows sum to the lift without the
-    weight. `weight` (full,) is the weight at all nodes, negative as it points downwards [N].
+    The force at each node is assigned to the nearest station; the sum of the rows is the lift
+    without the weight. `weight` (3 nodes,) is the weight at all nodes, negative as it points
+    downwards [N].
     """
     mesh = operators.wing_mesh
     lift_of_unknowns = turn_load(operators.body)
@@ -265,7 +268,7 @@ def _lift_rows(
 
 
 def _skin_strips(operators: AffineOperators) -> _SkinStrips:
-    """Split the stiffness of the skin by strips between mesh lines and by stiffness terms."""
+    """Divide the stiffness of the skin among strips between mesh lines, and stiffness terms."""
     mesh = operators.wing_mesh
     _, centre_position, _ = mesh.centres.T
     strip_of_cell = np.searchsorted(mesh.span_lines, centre_position) - 1

@@ -164,7 +164,11 @@ def _missing_description_sentence(file: Path, entry_names: set[str]) -> str:
 def _missing_binary_sentence(
     file: Path, entry_names: set[str], binary: str, platforms: tuple[str, ...]
 ) -> str:
-    """Return the message about an FMU whose binary for this platform is missing or misnamed."""
+    """Return the message about an FMU whose binary for this platform is missing or misnamed.
+
+    `binary` is the expected name in the archive, `entry_names` are the names that it has, and
+    `platforms` those for which it has a binary.
+    """
     if f"./{binary}" in entry_names:
         return f"{file} has no binary {binary}, but one named './{binary}': {_PACK_WITHOUT_DOT}"
     path = PurePosixPath(binary)
@@ -191,7 +195,7 @@ def extract_fmu(description: FmuDescription) -> Path:
     Parameters
     ----------
     description : FmuDescription
-        The file must not have changed since `read_fmu` returned this.
+        The result of `read_fmu`, since which the file must not have changed.
 
     Returns
     -------

@@ -200,7 +200,9 @@ class Binding(Section):
         )
 
     def with_header(self, **changes: object) -> "Binding":
-        """Return the binding with other values in its table `[binding]`; only words are checked.
+        """Return the binding with other values in its table `[binding]`.
+
+        Only keys with a fixed set of words are checked.
 
         Parameters
         ----------
@@ -219,10 +221,10 @@ class Binding(Section):
         return self.model_copy(update={"binding": header})
 
     def with_regions(self, regions: Sequence[str]) -> "Binding":
-        """Return the binding for a wing with these damage regions: their health inputs, no others.
+        """Return the binding with one health input for each damage region of a wing.
 
-        An input that the binding has for a region stays as it is; the others are called as their
-        regions.
+        An input that the binding has for a region stays as it is. A new input has the name of its
+        region. Inputs for other regions are left out.
 
         Parameters
         ----------

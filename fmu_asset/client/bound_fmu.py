@@ -40,7 +40,7 @@ class VariableElements(NamedTuple):
 def find_variable(
     description: FmuDescription, name: str, label: str, causality: str
 ) -> VariableElements:
-    """Return the FMU's variable, or the element of an array, that a binding names.
+    """Find the variable of the FMU, or the element of an array, that a binding names.
 
     Parameters
     ----------
@@ -73,9 +73,9 @@ def find_variable(
 
 
 def _find_element(description: FmuDescription, name: str, label: str) -> VariableElements | None:
-    """Return the array element that a name like `p[3]` means.
+    """Return the array element that a name such as `p[3]` stands for.
 
-    None if the name has another form, or the FMU has no such array.
+    The result is None if the name has another form, or if the FMU has no such array.
     """
     match = _ELEMENT.fullmatch(name)
     if match is None:
@@ -97,7 +97,11 @@ def _find_element(description: FmuDescription, name: str, label: str) -> Variabl
 def _check_use(
     description: FmuDescription, variable: VariableInfo, causality: str, name: str, label: str
 ) -> None:
-    """Raise an error if a variable cannot be used as its causality asks; see `find_variable`."""
+    """Raise an error if a binding cannot use a variable in this way; see `find_variable`.
+
+    `causality` is the intended use; `name` is the variable's name in the binding, and `label` says
+    where the binding has it.
+    """
     is_tunable_input = (
         causality == "input"
         and variable.causality == "parameter"
@@ -294,7 +298,7 @@ class BoundFmu:
         variable: VariableInfo,
         positions: Sequence[int] = (),
     ) -> BoundInput:
-        """Return an input of the binding, resolved against a variable of the FMU.
+        """Combine an input of the binding with the FMU's variable: their ranges and their units.
 
         Parameters
         ----------
@@ -356,11 +360,11 @@ class BoundFmu:
     # ------------------------------------------------------------------ ports
 
     def port_quantities(self, faults: BindingFaults) -> list[PortQuantity]:
-        """Return the quantities of all ports of the binding, and record what does not fit.
+        """Return the quantities of all ports of the binding; collect what does not fit in `faults`.
 
-        A port does not fit if a variable is not in the FMU, if it mixes inputs and outputs, or if
-        force and motion are both inputs or both outputs. The quantities of a port are compared with
-        each other only if each of them fits.
+        A port does not fit if a variable is not in the FMU, if a quantity mixes inputs and outputs,
+        or if force and motion are both inputs or both outputs. The quantities of a port are
+        compared with each other only if each of them fits.
         """
         quantities = []
         for port_name, port in self.binding.port.items():
@@ -382,7 +386,10 @@ class BoundFmu:
             self.unit_conversion(variable, unit, label)
 
     def _quantities_of_port(self, port_name: str, port: PortBinding) -> list[PortQuantity]:
-        """Return the quantities of a port; raise an error unless force and motion are opposite."""
+        """Return the quantities of a port.
+
+        Raises `BindingError` unless the force is an input and the motion an output, or vice versa.
+        """
         quantities = []
         force_count = len(port.force.variables)
         is_output_of_quantity: dict[str, bool] = {}
@@ -467,7 +474,9 @@ def start_values(
 def with_structural_parameters(
     description: FmuDescription, binding: Binding
 ) -> tuple[FmuDescription, list[InitialValue]]:
-    """Return the FMU with the array sizes that a binding chooses, and the values to set for them.
+    """Give the FMU's arrays the sizes that the structural parameters of a binding choose.
+
+    Returns the description with arrays of these sizes, and the values to set at the start.
 
     Raises
     ------

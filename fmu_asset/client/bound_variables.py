@@ -141,7 +141,7 @@ class VectorBinding(Section):
         return self.unit
 
     def by_element(self, elements: Callable[[str], Sequence[str]]) -> Self:
-        """Return the vector with each array replaced by its elements.
+        """Return the vector with each array among its variables replaced by the elements.
 
         Parameters
         ----------

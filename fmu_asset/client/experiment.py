@@ -167,7 +167,9 @@ def whole_binding(description: FmuDescription, *, step_size: float | None = None
     """
     numeric_variables = [variable for variable in description.variables if bindable(variable)]
     text_parameters = [variable for variable in description.variables if variable.is_text_parameter]
-    settable = [v for v in [*numeric_variables, *text_parameters] if v.variability != "constant"]
+    settable_variables = [
+        v for v in [*numeric_variables, *text_parameters] if v.variability != "constant"
+    ]
     observation = {}
     for variable in observable(description, numeric_variables):
         unit = variable.unit or "1"
@@ -179,8 +181,8 @@ def whole_binding(description: FmuDescription, *, step_size: float | None = None
             start_time=description.start_time or 0.0,
             interface=description.interface,
         ),
-        load=_bound_variables(settable, "input", InputBinding),
-        parameter=_bound_variables(settable, "parameter", ParameterBinding),
+        load=_bound_variables(settable_variables, "input", InputBinding),
+        parameter=_bound_variables(settable_variables, "parameter", ParameterBinding),
         observation=observation,
     )
 
@@ -197,7 +199,7 @@ def _bound_variables(
 
 
 def _steps_until(start: float, end: float, size: float | None) -> tuple[int, float]:
-    """Return the number and the size of the steps from a start to an end [s].
+    """Return the number of steps from `start` to `end` [s], and their size [s].
 
     If no size is given, there are `_DEFAULT_STEPS` steps.
     """

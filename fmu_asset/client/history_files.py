@@ -42,12 +42,12 @@ class _InputName(NamedTuple):
 
 
 def read_histories(path: Path, binding: Binding) -> tuple[int, InputHistories]:
-    """Read the number of steps, and the inputs of each step, from a CSV file.
+    """Read the number of steps, and the inputs in each step, from a CSV file.
 
-    The first line names the columns: `time` [s], which begins at the binding's start time and goes
-    on by its interval, and inputs as `control.load_factor`, or `load_factor` where no other role
-    has that name; the elements of an array are `u[1]`, `u[2]`, .... The values of a line hold over
-    the step that begins at its time.
+    The first line names the columns. One is `time` [s], which begins at the binding's start time
+    and grows by its step size. The others are inputs, such as `control.load_factor`, or only
+    `load_factor` if no other role has an input of this name; the elements of an array are `u[1]`,
+    `u[2]`, and so on. The values of a line hold over the step that begins at its time.
 
     Raises
     ------

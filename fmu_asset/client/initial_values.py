@@ -62,7 +62,9 @@ class InitialValueTable:
         parameters: Mapping[str, npt.ArrayLike],
         health: Mapping[str, npt.ArrayLike] | None = None,
     ) -> InitialValues:
-        """Return the values to set before the initialisation; the caller's override the binding's.
+        """Return the values to set before the initialisation: the binding's and the caller's.
+
+        If both have a value for one parameter, the caller's holds.
 
         Parameters
         ----------
@@ -102,7 +104,10 @@ class InitialValueTable:
     def _numbers(
         self, inputs_and_values: list[tuple[BoundInput, npt.ArrayLike]]
     ) -> list[InitialValue]:
-        """Return the values of numeric variables, with the elements of each array joined."""
+        """Return one value for each numeric variable, with the elements of an array put together.
+
+        Elements of an array that no input sets have their start values.
+        """
         numbers_by_variable: dict[str, list[float]] = {}
         variables: dict[str, VariableInfo] = {}
         description = self._fmu.description

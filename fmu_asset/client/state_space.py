@@ -102,12 +102,12 @@ class FmuStateSpace:
     release_states: FloatArray
 
     def in_coordinates_of(self, reference: "FmuStateSpace") -> "FmuStateSpace":
-        """Return the same system in the state coordinates of another system of its order.
+        """Return the same system in the state coordinates of a reference system of its order.
 
-        The coordinates of an identified state are arbitrary, so the states of two systems of one
-        FMU with different parameters cannot be compared. Their outputs and rates of outputs can:
-        the new coordinates T are those in which the rows [C; C A] of both systems agree best (least
-        squares).
+        The coordinates of an identified state are arbitrary, so that the states of two systems of
+        one FMU with different parameters cannot be compared. Their outputs and rates of outputs
+        can: the new coordinates are those in which the rows [C; C A] of both systems agree best
+        (least squares).
         """
         own_rows = _outputs_and_rates(self)
         reference_rows = _outputs_and_rates(reference)
@@ -296,7 +296,8 @@ def realise_state_space(records: FloatArray, forces: int, step: float) -> FmuSta
     """Identify a linear system from its recorded responses to unit forces and releases.
 
     The method is the eigensystem realisation algorithm of Juang and Pappa (1985), which builds on
-    Ho and Kalman (1966). Random mixtures of the outputs replace the outputs in the Hankel matrix.
+    Ho and Kalman (1966). In the Hankel matrix, a few random linear combinations of the outputs take
+    the place of all outputs, which keeps the matrix small.
 
     Parameters
     ----------
@@ -348,8 +349,8 @@ def _hankel_matrices(records: FloatArray) -> HankelMatrices:
     mixtures = mixing @ records
     height = min(HANKEL_ROWS, (samples - 2) // 2)
     width = min(HANKEL_COLUMNS, samples - 2 - height)
-    # Sample 0 is left out, since it contains the feedthrough of the forces.
-    # one block row more than needed: the two matrices are all but the last, and all but the first
+    # Sample 0 is left out, since it contains the feedthrough of the forces. There is one block row
+    # more than needed: the two matrices are all but the last, and all but the first.
     sample_of_block = 1 + np.arange(height + 1)[:, None] + np.arange(width)
     blocks = mixtures[sample_of_block].transpose(0, 2, 1, 3)
     matrix = blocks.reshape((height + 1) * MIXTURES, width * inputs)
@@ -438,10 +439,10 @@ def _states_in_time(transition: FloatArray, first: FloatArray, samples: int) -> 
 def _in_continuous_time(
     system: DiscreteSystem, first_outputs: FloatArray, step: float
 ) -> FmuStateSpace:
-    """Return the continuous-time system that has the samples of a discrete-time system.
+    """Convert a discrete-time system with a step [s] to the continuous-time system it samples.
 
-    Forces are constant during a step [s] (zero-order hold). `first_outputs` (C, E) are the outputs
-    at the end of the first step, during which each unit force acts.
+    Forces are constant during a step (zero-order hold). `first_outputs` (C, E) are the outputs at
+    the end of the first step, during which a unit of each force acts.
     """
     order = len(system.transition)
     forces = first_outputs.shape[1]

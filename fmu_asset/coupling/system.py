@@ -126,7 +126,7 @@ def system_description(wiring: Wiring, sha256: str = "") -> SystemDescription:
 
 
 def _connector_variable(wiring: Wiring, connector: Connector) -> _SystemVariable:
-    """Return a connector of the system as a variable of the system."""
+    """Return a connector of the system as a variable, with units and items of its ends."""
     ports = wiring.ends[connector.name]
     infos = [wiring.variable(port.end) for port in ports]
     if connector.kind == "output" and ports:
@@ -156,7 +156,11 @@ def _connector_variable(wiring: Wiring, connector: Connector) -> _SystemVariable
 def _component_variable(
     wiring: Wiring, end: Endpoint, info: VariableInfo, *, is_exposed: bool
 ) -> _SystemVariable:
-    """Return a component's variable as one of the system; local if an output exposes it."""
+    """Return a variable of a component as a variable of the system.
+
+    It is local if an output of the system exposes it, and no input any more if a connection feeds
+    it.
+    """
     causality = info.causality
     if end in wiring.feeds:
         causality = "an input that is fed by a connection already"
@@ -187,7 +191,7 @@ def _smallest_step(wiring: Wiring) -> float | None:
 
 
 def wiring_hash(wiring: Wiring, binding: Binding, *algorithm: str | float) -> str:
-    """Return the SHA-256 of everything that the meaning of a saved state depends on.
+    """Return a SHA-256 of everything on which the meaning of a saved state depends.
 
     The paths of the FMU files do not count.
 

@@ -196,7 +196,7 @@ def values_of(block: DoubleBlock) -> Float:
 def group_arguments(
     fmi_version: int, group: VariableGroup, doubles: DoubleBlock, begin: int, *, sent: bool
 ) -> GroupArguments:
-    """Return the arguments of a C function that sets or reads a group of variables.
+    """Prepare the arguments of a C function that sets or reads a group of variables.
 
     Parameters
     ----------
@@ -211,8 +211,8 @@ def group_arguments(
     """
     c_type = _BOOLEAN_TYPES[fmi_version] if group.kind == "Boolean" else _C_TYPES[group.kind]
     convert = None
-    # Values of type double are used where they stand; others are converted to and from an array
-    # of their type.
+    # Values of type double are passed as they stand in `doubles`; others are converted to or from
+    # an array of their own type.
     if c_type is ctypes.c_double and group.count:
         values = (c_type * group.count).from_buffer(doubles, 8 * begin)
     else:
@@ -240,7 +240,7 @@ _Function = ctypes.CFUNCTYPE(ctypes.c_int)
 
 
 def prepare_call(function: "CFunction", *arguments: object) -> Callable[[], int]:
-    """Return a call with fixed arguments, so that a step neither looks up nor converts anything.
+    """Bind a C function to fixed arguments, so that a step neither looks up nor converts anything.
 
     Parameters
     ----------

@@ -246,7 +246,7 @@ def python_members(
     resources: Mapping[str, bytes],
     host: str = "It runs in a Python host that has NumPy.",
 ) -> dict[str, bytes]:
-    """Return the files of a Python FMU, with the placeholder instead of the content hash.
+    """Return the files of a Python FMU, in which a placeholder stands for the content hash.
 
     Parameters
     ----------
@@ -288,18 +288,18 @@ def sealed(
     template: Mapping[str, bytes],
     make_binaries: Callable[[dict[str, bytes], str], dict[str, bytes]] | None = None,
 ) -> SealedFmu:
-    """Pack an FMU's files after their hash has replaced the placeholder.
+    """Replace the placeholder in an FMU's files by their hash, and pack them.
 
-    The hash is taken over the names and contents of the files with the placeholder, so that equal
-    files give equal bytes.
+    The hash is taken over the names and contents of the files with the placeholder. Equal files
+    therefore give equal bytes.
 
     Parameters
     ----------
     template : mapping of str to bytes
         The files by name, with the placeholder.
     make_binaries : callable, optional
-        Makes further files, which are not part of the hash, from the files with their hash and the
-        tag.
+        Returns further files, given the files with their hash, and the tag: the first digits of the
+        hash. They are not part of the hash.
     """
     content_hash = hash_members(template)
     tag = content_hash[: len(PLACEHOLDER)]

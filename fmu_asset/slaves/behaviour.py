@@ -175,7 +175,7 @@ class StructureBehaviour:
     # ------------------------------------------------------------ saved states
 
     def state(self) -> list[float]:
-        """Return all numbers that are needed to continue, except the parameters.
+        """Return the state as numbers: all that is needed to continue, except the parameters.
 
         The first number counts the parts; each part follows as its length and its numbers.
         """
@@ -272,7 +272,10 @@ class StructureBehaviour:
             raise UnacceptableValuesError(f"{sentence}.") from error
 
     def _outputs_after(self, time: float, duration: float, inputs: Sequence[float]) -> list[float]:
-        """Return the outputs after a step, or at the start if there is no state yet."""
+        """Return the outputs after a step of some duration [s] from a time [s], with given inputs.
+
+        If there is no state yet, they are the outputs at the start.
+        """
         has_changed = self._effects is not None and self._take_effects(self._effects)
         values = {**self._parameters, **dict(zip(self._inputs, inputs, strict=True))}
         vector = np.array([values[name] for name in self._roles.chosen])

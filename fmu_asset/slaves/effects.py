@@ -64,7 +64,7 @@ class PrimitiveNumber(NamedTuple):
 
 
 def numbers_of(effect: EffectRecord) -> dict[str, PrimitiveNumber]:
-    """Return the numbers of an effect by the names of their FMU variables.
+    """Return the numbers in the primitives of an effect, by the names of their FMU variables.
 
     The variable of a number is called `effect.<id>.<key>`. If several primitives of the effect have
     a number with this key, it is called `effect.<id>.<key>[n]`, with the number n of the primitive
@@ -168,7 +168,7 @@ def _add_number(
     key: str,
     start: Mapping[str, float],
 ) -> None:
-    """Add the variable of a primitive's number, which by default keeps its value."""
+    """Add an FMU variable for a number of a primitive; its default is the number itself."""
     value = primitive[key]
     assert isinstance(value, int | float)  # `numbers_of` names no other values
     location = primitive.get("port") or primitive.get("channel") or ""
@@ -191,7 +191,7 @@ def _add_number(
 def active_primitives(
     effects: Sequence[EffectRecord], values: Mapping[str, float]
 ) -> list[PrimitiveRecord]:
-    """Return the primitives of the active effects, with the present values.
+    """Return the primitives of the effects that are switched on, with the values of the variables.
 
     Parameters
     ----------
@@ -381,7 +381,7 @@ class SwitchableEffects:
         Parameters
         ----------
         vector : (V,) ndarray
-            The values of the model. The last two are controls, which do not affect the integrator.
+            The inputs of the model. The last two are controls, which do not affect the integrator.
         damping : (float, float)
             The coefficients of Rayleigh damping for mass [1/s] and stiffness [s].
         """

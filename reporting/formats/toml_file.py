@@ -63,7 +63,7 @@ def read_toml(path: Path | str, error: type[Exception], *, what: str = "file") -
 
 
 def parse_toml(content: bytes | str, source: str, error: type[Exception]) -> TomlTable:
-    """Return the content of a TOML text.
+    """Parse a TOML text, and refuse what is nested too deeply or has too large integers.
 
     Parameters
     ----------

@@ -189,7 +189,7 @@ def publication_style() -> Iterator[None]:
 
 
 def new_figure(height: float, width: float = FULL_WIDTH) -> Figure:
-    """Return an empty figure, drawn by Agg and unknown to pyplot.
+    """Return an empty figure that is drawn by Agg and that pyplot does not keep.
 
     Parameters
     ----------
@@ -361,7 +361,7 @@ def color_bar(
     label : str
         The quantity and its unit.
     ax : Axes or sequence of Axes, optional
-        The panels from which the bar takes its room, if it has no panel of its own.
+        The panels that are made smaller to give the bar room, if it has no panel of its own.
     cax : Axes, optional
         The panel in which the bar is drawn.
     location : str, optional

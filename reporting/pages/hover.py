@@ -59,11 +59,11 @@ class _Annotation(NamedTuple):
 
 @contextmanager
 def annotated(figure: Figure) -> Iterator[Callable[[str], str]]:
-    """Return a context in which a figure is drawn as SVG, so that a page can show its values.
+    """Mark the artists of a figure while it is drawn as SVG, so that a page can show their values.
 
-    The context yields a function: given the text of the SVG, it returns the text with the
-    attributes that the script of the page reads. Call it inside the context, which marks the
-    artists by their group ids and removes these at its end.
+    The context yields a function that adds to the text of the SVG the attributes which the script
+    of the page reads. It must be called inside the context, which marks the artists by group ids
+    and removes these at its end.
 
     Panels get ``data-axes`` (box in units of the SVG; limits, scale, name and tick texts of both
     axes), lines and scatters ``data-series`` (name, colour), bands and error bars ``data-spread``
@@ -212,7 +212,7 @@ def _look_of(artist: Line2D | PathCollection) -> _LineLook:
 
 
 def _panel_record(axes: Axes) -> JsonObject:
-    """Return title, box in the SVG, heat maps and axes of a panel that has been drawn."""
+    """Return the record of a drawn panel for the script: title, box in the SVG, maps and axes."""
     figure = axes.get_figure(root=True)
     assert figure is not None
     width, height = (_POINTS_PER_INCH * inches for inches in figure.get_size_inches())

@@ -269,9 +269,9 @@ def lower_priority(niceness: int, process_id: int = 0) -> None:
 
 @contextmanager
 def call_on_end_signal(request_end: Callable[[], None]) -> Iterator[None]:
-    """Return a context in which SIGINT and SIGTERM call a function instead of ending the process.
+    """Let SIGINT and SIGTERM call a function, instead of ending the process, within a context.
 
-    The former handlers are restored at the end. Only the main thread of a process may set handlers:
+    The former handlers are restored at the end. Only the main thread of a process may set handlers;
     in another thread the context changes nothing.
     """
     if threading.current_thread() is not threading.main_thread():
@@ -325,10 +325,10 @@ def _can_poll(stream: ReadableStream) -> bool:
 
 
 def pieces_read_by_thread(stream: ReadableStream, size: int) -> Iterator[bytes | None]:
-    """Yield the pieces of a stream as they arrive, as `polled_pieces` does, by means of a thread.
+    """Yield the pieces of a stream as they arrive, and None as long as there is no new one.
 
-    The thread waits for the stream and puts each piece into a queue; the caller, who takes pieces
-    from the queue, never waits. An error in the thread is raised in the caller.
+    A thread waits for the stream and puts each piece into a queue, so that the caller never waits.
+    An error in the thread is raised in the caller.
     """
     end_of_stream = b""
     arrivals: queue.SimpleQueue[bytes | BaseException] = queue.SimpleQueue()

@@ -134,7 +134,7 @@ Predict = Callable[[Mapping[str, float], Mapping[str, float]], Float]
 
 
 def table_of_observations(scenario: Scenario, states: Float, predict: Predict) -> Float:
-    """Return the predicted observations (S, U, G) in all joint states under all controls.
+    """Predict the observations (S, U, G) in each joint state under each control, one by one.
 
     Parameters
     ----------
@@ -208,7 +208,7 @@ class AssetAndModel:
 def calibration_sentence(
     record: JsonRecord, asset: str, believed: str, hashes: Mapping[str, str]
 ) -> str | None:
-    """Return two sentences: which model was calibrated, and whether the twin believes its design.
+    """Say which model was calibrated, and whether the twin believes the design of that model.
 
     Parameters
     ----------

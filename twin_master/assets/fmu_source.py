@@ -300,7 +300,7 @@ class FmuSource(AssetSource):
         return ()
 
     def _check_names(self, binding: Binding) -> None:
-        """Refuse a scenario with names that the binding does not have."""
+        """Refuse states, control inputs, loads and parameters that the binding does not have."""
         scenario = self._scenario
         section = self.section
         # If the damage is inside the asset, the binding has no health inputs.
@@ -314,12 +314,12 @@ class FmuSource(AssetSource):
             "that is set at the start"
         )
         check_names(owner, label, [("state", states, binding.health)], advice=advice)
-        names_by_sort = (
+        names_by_kind = (
             ("control input", scenario.control[0].values, binding.control),
             ("load", section.load, binding.load),
             ("parameter", given_parameters, known_parameters),
         )
-        check_names(owner, label, names_by_sort)
+        check_names(owner, label, names_by_kind)
 
     def _fit_binding(self, binding: Binding) -> Binding:
         """Check the binding against the FMU; return it with the lengths of the FMU's arrays.
@@ -394,7 +394,7 @@ class FmuSource(AssetSource):
         return hashes
 
     def observation_table(self, draws: ParameterDraws, model: GraphicalModel) -> Float:
-        """Return the observations (E, S, U, G) of the FMU, by draw, state, control and sensor.
+        """Predict the observations (E, S, U, G) by the FMU, by draw, state, control and sensor.
 
         The FMU is reset once for each draw, and then makes one step for each state and control. An
         FMU that remembers earlier steps would therefore give wrong predictions.
@@ -420,9 +420,9 @@ class FmuSource(AssetSource):
         return np.array(tables)
 
     def _observation_slice(self, binding: Binding, role: str = "") -> slice:
-        """Return the positions of a role among the observed values of the binding.
+        """Return the positions of an observed quantity among the observed values of the binding.
 
-        A role is the name of an observed quantity; if it is empty, that of the scenario is taken.
+        `role` is the name of the quantity in the binding; if it is empty, the scenario names it.
         The number and the units of its values must be those of the scenario.
         """
         observation = self._scenario.observation
@@ -527,15 +527,22 @@ def _check_calibrated_units(binding: Binding, calibration: "CalibrationRecord") 
 def _check_unit(binding: Binding, what: str, bound_unit: str, key: str, unit: str) -> None:
     """Refuse a unit of the scenario that is not the unit in the binding.
 
-    "1" is the default of a scenario, and so may stand for any unit. It is refused only for a
-    dimensionless quantity with a scale of its own, such as a percentage, whose values it would
+    The unit "1" is the default of a scenario, and so may stand for any unit. It is refused only if
+    the binding's unit is dimensionless with a factor, such as %, because the values would then be
     misread.
+
+    Parameters
+    ----------
+    what, bound_unit : str
+        The quantity in words, and its unit in the binding.
+    key, unit : str
+        The key of the scenario, and the unit that it states.
     """
     if bound_unit == unit:
         return  # saves the third of a second in which the library of units loads
-    meaning = conversion_of(bound_unit)
+    conversion = conversion_of(bound_unit)
     is_scaled_fraction = (
-        meaning is not None and not any(meaning.exponents) and meaning.factor != 1.0
+        conversion is not None and not any(conversion.exponents) and conversion.factor != 1.0
     )
     if unit != "1" or is_scaled_fraction:
         raise MissionInputError(

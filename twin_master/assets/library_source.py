@@ -212,10 +212,10 @@ class ObservationLibrary:
         )
 
     def observations_at(self, name: str, draws: Float) -> Float:
-        """Return the observations at given values of the parameter.
+        """Interpolate the observations linearly at given values of the parameter.
 
-        They are interpolated linearly between the sampled values. A library without a parameter
-        serves a single draw of any parameter.
+        A library without a parameter gives the same observations for a single draw of any
+        parameter.
 
         Parameters
         ----------

@@ -76,7 +76,7 @@ OverridesOrMapping: TypeAlias = Overrides | Mapping[str, object]
 
 
 def as_overrides(overrides: OverridesOrMapping | None) -> Overrides:
-    """Return overrides as a record.
+    """Return overrides of a scenario, such as another FMU, as a checked record.
 
     Parameters
     ----------
@@ -149,7 +149,7 @@ def resolve_scenario(
 
 
 def _override_asset(table: Table, overrides: Overrides) -> None:
-    """Replace the asset of a scenario's table, in place, if the command line names another.
+    """Replace the asset of a scenario's table, in place, if the overrides name another.
 
     The keys of the scenario's asset are kept if the kind of the new asset has them.
     """
@@ -206,10 +206,10 @@ def _design_tables(table: Table) -> list[Table]:
 
 
 def _use_calibrated_design(table: Table) -> None:
-    """Replace designs in a scenario's table, in place, by the design of the calibration file.
+    """Let a scenario's table, in place, name the calibrated design instead of designs of its own.
 
-    These are the design of the asset, the believed design, and the designs of components that equal
-    it.
+    Replaced are the design of the asset, the design that the twin believes, and the designs of
+    components that equal the believed one.
     """
     asset = table["asset"]
     belief = table["belief"]
@@ -353,10 +353,10 @@ class LearntFile(Section):
 
 
 def apply_learnt(table: Table, path: Path, group: str | None = None) -> None:
-    """Replace assumptions in a scenario's table by the results of a fleet.
+    """Replace assumptions in a scenario's table, in place, by what was learnt from a fleet.
 
-    These are the transitions, the sensor noise and the distribution of the parameter. The truth of
-    the scenario stays the same.
+    These are the transitions, the sensor noise and the distribution of the parameter. The ground
+    truth of the scenario stays the same.
 
     Parameters
     ----------

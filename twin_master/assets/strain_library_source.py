@@ -143,7 +143,7 @@ def load_strain_library(path: str | Path) -> StrainLibrary:
 
 
 def _parse_library(content: JsonRecord) -> StrainLibrary:
-    """Return the library that the authors' file contains.
+    """Build the library from the content of the authors' file.
 
     Its entry `observations[z1][z2][control][draw]` has the strain of each gauge in microstrain; z1
     and z2 are losses in percent, and the draw is a factor on Young's modulus, or "mean".

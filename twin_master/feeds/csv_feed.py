@@ -43,8 +43,8 @@ class CsvFeed(RecordedFeed):
         """Return the names of the columns from the first line of the file.
 
         A file that was just created, or was rotated by copying and truncating, may begin with a row
-        of readings. If it is followed, the header of the newest rotated file with one is returned
-        then. A `MissionInputError` is raised if no file has a header.
+        of readings. If the file is followed, the header is then taken from the newest rotated file
+        that has one. A `MissionInputError` is raised if no file has a header.
         """
         files = [self.path]
         if self.follow:
@@ -143,10 +143,10 @@ class CsvFeed(RecordedFeed):
         return file
 
     def content_of(self, line: bytes, begin: int) -> MessageContent | None:
-        """Return the message in a row, or a refusal of the row.
+        """Return the message in a row, or the reason why the row is refused.
 
-        If the row is a header, the columns are set by it, and None is returned. Only the first line
-        of a file can be a header.
+        A header, which only the first line of a file can be, sets the columns; the result is then
+        None.
         """
         try:
             cells = _split_cells(line)

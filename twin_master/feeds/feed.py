@@ -138,8 +138,8 @@ class RecordedFeed(Feed):
     def messages(self, position: Position | None) -> Iterator[FeedItem]:
         """Yield each message after a position of the file, with the beginning of its text.
 
-        While the file has no further line, (None, "") is yielded. `self.position` is moved to the
-        end of a line before the last message of the line is yielded, or if the line has none.
+        As long as the file has no further line, (None, "") is yielded. `self.position` becomes the
+        end of a line before the last of its messages is yielded, or at once if it has no message.
 
         Parameters
         ----------
@@ -312,10 +312,10 @@ class FolderFeed(RecordedFeed):
             )
 
     def content_of(self, line: bytes, begin: int) -> MessageContent | None:
-        """Return the observation in a line of the journal, or a refusal of the line.
+        """Return the observation in a line of the journal, or the reason why it is refused.
 
-        None is returned if the line has no observation, or if it is the incomplete last line of a
-        killed process.
+        The result is None if the line has no observation, or if it is the incomplete last line of a
+        process that was killed.
 
         Parameters
         ----------

@@ -197,28 +197,28 @@ class Intake:
         return state
 
     def journal_line(self, step: MissionStep, twin: Twin) -> JsonObject:
-        """Return the journal's line for the last reading and the conclusions of the twin.
+        """Return the line of the journal for the last reading and what the twin concluded from it.
 
         Every `SNAPSHOT_STEPS` steps the line also contains the state of the twin, from which a
         resumed watch goes on. Notices that the twin itself gives are not added a second time.
         """
-        concluded = step.twin_step
+        twin_step = step.twin_step
         record = step_record(step) | {
             "observation_step": self.observation_step,
             "control_index": twin.control_of(self.observation_step),
             "intake": self.state(),
         }
         if step.reading.revises is not None:
-            record["control_in_force"] = concluded.control_index
-        elif (concluded.step + 1) % SNAPSHOT_STEPS == 0:
+            record["control_in_force"] = twin_step.control_index
+        elif (twin_step.step + 1) % SNAPSHOT_STEPS == 0:
             settled = twin.settled()
             if settled:
                 settled_step, settled_state = settled
                 record["settled"] = {"step": settled_step, "state": encode_state(settled_state)}
-        given_by_twin = {(notice.kind, notice.sensors) for notice in concluded.notices}
+        notices_of_twin = {(notice.kind, notice.sensors) for notice in twin_step.notices}
         new_notices = []
         for notice in self.notices:
-            if (notice.kind, notice.sensors) not in given_by_twin:
+            if (notice.kind, notice.sensors) not in notices_of_twin:
                 new_notices.append(notice.as_record())
         if new_notices:
             record["notices"] = record.get("notices", []) + new_notices
@@ -233,9 +233,9 @@ class Intake:
         - another file: at its first message;
         - a feed that cannot be read twice, such as a pipe: at what comes next.
 
-        Messages may have been written to `rejected.jsonl` after the state was recorded. The first
-        kind of feed gives them again; for the others they are added to the counts here. The state
-        is None at the beginning of a watch.
+        Messages may have been written to `rejected.jsonl` after the state was recorded. If reading
+        continues at the recorded position, they are read again; otherwise they are counted here.
+        The state is None at the beginning of a watch.
         """
         feed_is_read_again = self._feed.replayable
         if state is not None:
@@ -332,8 +332,8 @@ class Intake:
     def _next_reading(self, twin: Twin) -> Reading:
         """Take the first reading from the queue, record it, and return it.
 
-        Recording it updates the notices, the counts, and the status of its step. The state before
-        is kept, because the twin may find the reading impossible.
+        This updates the notices, the counts and the status of its step. The previous state is kept
+        for the case that the twin finds the reading impossible.
         """
         queued = self._queue.popleft()
         reading = queued.reading
@@ -382,7 +382,7 @@ class Intake:
         return self.stream.accept(step, is_blind=is_blind, ignored=ignored)
 
     def complaint(self) -> str:
-        """Return why the messages of this process were of no use, as a sentence.
+        """Return a sentence that says why the messages of this process were of no use, or "".
 
         The first of these cases that holds decides:
 
@@ -474,8 +474,9 @@ class Intake:
     def _step_of(self, twin: Twin, message: Message) -> int:
         """Return the step of a message.
 
-        It is the step that the message names, else the step at its time, else the next step of the
-        twin. A late message belongs to the nearest step that it does not contradict.
+        It is the step that the message names, or else the step at its time, or else the next step
+        of the twin. A late message belongs to the nearest of several possible steps whose earlier
+        message it does not contradict.
         """
         clock, time = self._time_of(message)
         if time is None:

@@ -176,9 +176,10 @@ class MessageReader:
         self.likely_name = lru_cache(maxsize=1000)(self._find_likely_name)
 
     def _find_column(self, name: str) -> SensorColumn | None:
-        """Return the sensor of a name, with the factor to SI; None if it is not a sensor.
+        """Return the sensor that a name in a message means, with the factor to SI.
 
-        The name is that of a sensor, alone or followed by a unit, in brackets or after `_`.
+        The name is that of a sensor, alone or followed by a unit, in brackets or after `_`. Any
+        other name gives None.
 
         Raises
         ------
@@ -362,8 +363,8 @@ class MessageReader:
     def _read_time(self, value: object) -> float | None:
         """Return the time of a message [s]; None without one.
 
-        It is a number in the unit of the scenario, also in quotes, or a date and time by ISO 8601,
-        which is counted from 1970, in UTC if it has no offset.
+        It is a number in the unit of the scenario, which may be in quotes, or a date and time by
+        ISO 8601, which is counted from 1970, and is in UTC if it has no offset.
         """
         if value is None:
             return None

@@ -54,7 +54,9 @@ class StreamNotices:
         self._refusals_are_reported = False
 
     def state(self, *, waiting: bool) -> JsonObject:
-        """Return the state for the journal, so that a resumed watch gives no notice twice.
+        """Return what the journal keeps of the reported notices, so that none is given twice.
+
+        A watch that is resumed continues from this state.
 
         Parameters
         ----------
@@ -265,7 +267,7 @@ class StreamNotices:
     def report_refusals(self, next_step: int) -> Notice:
         """Return the notice that all messages since the last step were refused.
 
-        It is given once, until a message is accepted again.
+        After it, no such notice is due until a message is accepted again.
 
         Parameters
         ----------

@@ -40,19 +40,19 @@ def outcomes_of_group(group: "xr.DataTree") -> Outcomes:
 def earned_statistics(group: "xr.DataTree") -> dict[str, Statistic]:
     """Return what the flights of a group earned, by title; empty for stores without rewards.
 
-    The values are means over the flights with their standard errors. Failed flights are left out.
-    If a flight ended early, its flown steps are counted.
+    The values are means over the flights, with their standard errors. Failed flights are left out.
+    Of a flight that ended early, only the steps that it flew count.
     """
     if "earned" not in group.children:
         return {}
     controls = list(group.attrs["controls"])
-    of_controls = [f"steps with {control}" for control in controls]
+    keys_of_controls = [f"steps with {control}" for control in controls]
     moments = {
         key: Moments()
         for key in (
             RETURN,
             "reward of a step",
-            *of_controls,
+            *keys_of_controls,
             "steps beyond the limit",
             "needless steps",
             "steps beyond a health limit",
@@ -75,7 +75,7 @@ def earned_statistics(group: "xr.DataTree") -> dict[str, Statistic]:
             "needless steps": earned["needless"],
             "steps beyond a health limit": earned["health"] < 0.0,
         }
-        for index, key in enumerate(of_controls):
+        for index, key in enumerate(keys_of_controls):
             values_of_steps[key] = control == index
         moments[RETURN].add(earned["return"])
         for key, values in values_of_steps.items():
@@ -178,10 +178,10 @@ def statistics_of_fleets(folders: Sequence[Path]) -> Statistics:
 
 
 def compare_fleets(folders: Sequence[Path]) -> Statistics:
-    """Return the results of each group, beside what was promised and what the first group earned.
+    """Return the results of each group, beside the return that was planned and that of the first.
 
     Groups are compared seed by seed, because flights of one seed meet the same damage and noise
-    (common random numbers): the difference of their returns varies less than either of them.
+    (common random numbers): the difference of their returns varies less than the returns do.
 
     Raises
     ------
@@ -235,9 +235,9 @@ def returns_of_group(group: "xr.DataTree") -> Float:
 
 
 def _difference_of_returns(group: "xr.DataTree", other_group: "xr.DataTree") -> Estimated:
-    """Return how much more flights earn than those of another group under the same seeds.
+    """Return how much more flights earn, in the mean, than those of another group with equal seeds.
 
-    It is NaN if no seed has one flight in each group.
+    Only seeds with exactly one flight in each group count; the result is NaN if there is none.
     """
     returns_by_seed = []
     for tree in (group, other_group):
@@ -264,18 +264,18 @@ def unit_of_states(group: "xr.DataTree") -> str:
 
 
 def _counts_of_twins(group: "xr.DataTree") -> tuple[dict[str, Statistic], int]:
-    """Return the numbers of twins that flew, failed, ended early or gave notices, by title.
+    """Count the twins of a group that flew, failed, ended early or gave notices.
 
-    The number of twins that have outcomes is returned, too.
+    Returns the counts by title, and the number of twins that have outcomes.
     """
     status_counts = np.zeros(max(FLOWN, FAILED, ENDED) + 1, dtype=np.int64)
-    alarmed = 0
-    left_gauge_out = 0
+    alarmed_count = 0
+    left_gauge_out_count = 0
     for rows in row_blocks(group):
         status = stored_values(group, "status", rows)
         status_counts += np.bincount(status, minlength=len(status_counts))
-        alarmed += int(np.sum(notice_counts(group, "alarm", rows) > 0))
-        left_gauge_out += int(np.sum(notice_counts(group, "gauge_left_out", rows) > 0))
+        alarmed_count += int(np.sum(notice_counts(group, "alarm", rows) > 0))
+        left_gauge_out_count += int(np.sum(notice_counts(group, "gauge_left_out", rows) > 0))
     statistics: dict[str, Statistic] = {
         "twins": int(status_counts.sum()),
         "flown": int(status_counts[FLOWN]),
@@ -284,9 +284,9 @@ def _counts_of_twins(group: "xr.DataTree") -> tuple[dict[str, Statistic], int]:
     if status_counts[ENDED]:
         statistics["ended early"] = int(status_counts[ENDED])
     if group.attrs.get("gives_notice"):
-        statistics["raised an alarm"] = alarmed
-    if left_gauge_out:
-        statistics["left a gauge out"] = left_gauge_out
+        statistics["raised an alarm"] = alarmed_count
+    if left_gauge_out_count:
+        statistics["left a gauge out"] = left_gauge_out_count
     return statistics, int(status_counts[FLOWN] + status_counts[ENDED])
 
 

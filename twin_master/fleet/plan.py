@@ -305,12 +305,10 @@ def ensemble(
     *,
     shard: int = SHARD,
 ) -> Fleet:
-    """Return a fleet of one group in which one scenario is flown under many seeds.
+    """Return a fleet of one group in which one scenario is flown once for each of many seeds.
 
-    `fly_fleet` flies it.
-
-    The draws of the calibration are the same for all seeds; their seed is that of the scenario or
-    of the overrides.
+    The draws of the calibration are the same for all of them; their seed is that of the scenario or
+    of the overrides. `fly_fleet` flies the fleet.
 
     Parameters
     ----------
@@ -396,7 +394,8 @@ def _scenarios(
 ) -> tuple[Scenario, ...]:
     """Return the scenarios of a group: one for each FMU or calibration file, or a single one.
 
-    An error lists all files with which the scenario cannot be resolved.
+    The FMU or the calibration of the scenario is replaced by each of `files`. An error lists all
+    files with which the scenario cannot be resolved.
     """
     common_overrides = _common_overrides(section, folder, seed)
     if not files:

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 
 def open_fleet(folder: Path | str) -> "xr.DataTree":
-    """Return everything that a fleet has stored, as labelled arrays that are read at first use.
+    """Open everything that a fleet has stored, as labelled arrays that are read at first use.
 
     Returns
     -------
@@ -121,8 +121,8 @@ def severity(scenario: Scenario, mean: ArrayLike) -> Float:
 def probability_of_leaving(knowledge: Knowledge, belief: Float, control: int) -> Float:
     """Return the probability that twins leave a control within the scenario's `prediction_steps`.
 
-    If the policy maps states to controls, this is the probability that the predicted course of
-    states reaches one for which the policy chooses another control. If the policy maps beliefs to
+    If the policy maps states to controls, this is the probability that the state, as predicted,
+    comes to one for which the policy chooses another control. If the policy maps beliefs to
     controls, it is the fraction of simulated missions in which the control changes.
 
     Parameters

@@ -105,7 +105,10 @@ class FaultFilter:
         )
 
     def _predictions_of_pairs(self, values: Float) -> Predictions:
-        """Return the predictions at all pairs from the chosen draws' values (E', S, U, G)."""
+        """Return the predictions for all pairs of a state and a chosen draw.
+
+        `values` (E', S, U, G) are the predicted values by draw, state, control and sensor.
+        """
         draws, states, controls, sensors = values.shape
         shape = (controls, states, draws, sensors)
         shape_of_pairs = (controls, states * draws, sensors)
@@ -208,11 +211,12 @@ class FaultFilter:
         )
 
     def _begin_gauge_faults(self, state: WatchState, log_begins_now: Float) -> Float:
-        """Let faults of single gauges begin in this step, and return how probably they are older.
+        """Let faults of single gauges begin in this step; return the probability of older ones.
 
-        It is the probability (B, G K) that each fault began earlier, with which beliefs are mixed.
-        A fault that begins now has the sums of squares of the model so far. Old terms of the sums
-        about gains are forgotten, as gains may change.
+        This is the probability (B, G K) that each fault began before this step, given that it is
+        there; beliefs are mixed with this weight. A fault that begins now has the sums of squares
+        of the model so far. In the sums for the gains, old terms are forgotten, as gains may
+        change.
 
         Parameters
         ----------
@@ -222,8 +226,8 @@ class FaultFilter:
             The log prior probability that a fault begins in this step.
         """
         beliefs = state.beliefs
-        gains = len(_GAINS)
-        log_begin = log_begins_now[:, None] - np.log(gains)  # each gain with equal probability
+        gain_count = len(_GAINS)
+        log_begin = log_begins_now[:, None] - np.log(gain_count)  # each gain with equal probability
         log_total = log_of_sum(state.log_gauge_evidence, log_begin)
         earlier_weight = np.exp(state.log_gauge_evidence - log_total)
         state.log_gauge_evidence = log_total
@@ -234,17 +238,17 @@ class FaultFilter:
         forgetting = self._forgetting_factor()
         np.multiply(beliefs.gauge_sum_cc, forgetting * earlier_weight, out=beliefs.gauge_sum_cc)
         np.multiply(beliefs.gauge_sum_cx, forgetting * earlier_weight, out=beliefs.gauge_sum_cx)
-        model_squares = np.repeat(beliefs.model_squares, gains, axis=1)
+        model_squares = np.repeat(beliefs.model_squares, gain_count, axis=1)
         beliefs.gauge_squares[:] = (
             earlier_weight * beliefs.gauge_squares + (1.0 - earlier_weight) * model_squares
         )
         return np.asarray(earlier_weight)
 
     def _begin_free_gains(self, state: WatchState, log_begins_now: Float) -> Float:
-        """Let free gains begin in this step, and return the probability (B,) that they are older.
+        """Let free gains begin in this step; return the probability (B,) that they began before.
 
         Free gains are the fault that several gauges have unknown gains. It is treated as the faults
-        of single gauges in `_begin_gauge_faults`.
+        of single gauges are in `_begin_gauge_faults`.
 
         Parameters
         ----------
@@ -365,9 +369,9 @@ class FaultFilter:
         """
         beliefs = state.beliefs
         model_squares = beliefs.model_squares
-        gains = len(_GAINS)
-        difference = beliefs.gauge_squares - np.repeat(model_squares, gains, axis=1)
-        by_gauge = (recoveries.gauge_weight * difference).reshape(len(difference), -1, gains)
+        gain_count = len(_GAINS)
+        difference = beliefs.gauge_squares - np.repeat(model_squares, gain_count, axis=1)
+        by_gauge = (recoveries.gauge_weight * difference).reshape(len(difference), -1, gain_count)
         new_squares = model_squares + by_gauge.sum(axis=2)
         statistics = state.free_gain_statistics
         free_probability = statistics.free_probability
@@ -421,10 +425,10 @@ class FaultFilter:
 
 
 def _choose_even_draws(draws: Float, weight: Float) -> tuple[NDArray[np.int64], Float]:
-    """Choose at most `MOST_DRAWS` draws, evenly over the whole range of their values.
+    """Choose at most `MOST_DRAWS` draws of the parameter, evenly over the range of their values.
 
-    They are not chosen by probability, because a true value in a wide gap between two chosen draws
-    would look like a fault.
+    They are not chosen by probability, which would leave wide gaps: a true value in a gap would
+    look like a fault.
 
     Parameters
     ----------

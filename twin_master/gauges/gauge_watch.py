@@ -140,9 +140,10 @@ class GaugeWatch:
         self._standstill = StandstillTest.of(sensor_model.standard_deviation, settings)
 
     def _notice_writer(self, wording: NoticeWording, settings: Noticing) -> NoticeWriter:
-        """Return the writer of notices.
+        """Return the writer of notices, with the range of plausible readings of each gauge.
 
-        A reading is plausible if it is within a margin of the prediction of some draw and state.
+        A reading is plausible if it lies within a margin of the prediction in some state with some
+        draw of the parameter.
         """
         value = self._sensor_model.value_per_draw
         deviation = self._sensor_model.total_standard_deviation
@@ -162,7 +163,7 @@ class GaugeWatch:
     def exclude_useless_readings(
         self, state: WatchState | None, rows: Float, control_index: Index
     ) -> CheckedReadings:
-        """Return the observations of B twins, without readings that are absurd or stuck.
+        """Exclude absurd and stuck readings from the observations of B twins.
 
         Parameters
         ----------
@@ -331,8 +332,8 @@ class GaugeWatch:
     def alarm_evidence(self, state: WatchState) -> AlarmEvidence:
         """Return the evidence for each kind of fault, relative to that for the model.
 
-        It is summed over the steps in which the fault may begin. A fault that begins later predicts
-        so far what the model predicts: its term is the prior probability that it begins later.
+        It is summed over the steps in which the fault may begin. A fault that begins in the future
+        predicts what the model predicts so far; its term is the prior probability of that case.
         """
         log_begins_later = np.log(self.faults.probability_to_begin_after(state.step_count - 1.0))
         twins, gauges = state.left_out.shape
@@ -426,10 +427,10 @@ class WatchfulEstimator:
     def smoothed(self, carried: Sequence[Carried]) -> Float:
         """Return p(D_k | o_0..o_t) for the steps of `carried`, which end at t: (n, S).
 
-        Under the model, the inner estimator smooths. Under the competing hypotheses, the mixed
-        beliefs of the steps are smoothed, starting from the belief of the competing hypotheses in
-        the last step, which is approximate. The result is their average, weighted by the
-        probability of the model in the last step.
+        The result is the average of two smoothed beliefs, weighted by the probability of the model
+        in the last step. Under the model, the inner estimator smooths. Under the competing
+        hypotheses, approximately, the mixed beliefs of the steps are smoothed, starting from the
+        belief under the competing hypotheses in the last step.
         """
         under_model = self._inner.smoothed(carried)
         if not carried:

@@ -128,12 +128,12 @@ class HypothesisWeights:
         )
 
     def change_controls(self, previous_control: Index, control: Index) -> Float:
-        """Change the controls of B twins, each from and to its own (B,), as `change_control` does.
+        """Change the controls of B twins, given by arrays (B,), as `change_control` does for one.
 
         Returns
         -------
         (B, 1 + G K) array
-            By how much the probability rises that there is each fault and it is hidden; at least 0.
+            By how much the probability rises that a fault is there and hidden, for each fault.
         """
         newly_hidden = np.zeros_like(self.hidden)
         pairs = np.stack([previous_control, control], axis=1)
@@ -151,10 +151,11 @@ class HypothesisWeights:
         return newly_hidden
 
     def change_control(self, previous_control: int, control: int) -> Float:
-        """Divide each fault's probability anew into a showing and a hidden part.
+        """Divide the probability of each fault anew into its showing and its hidden part.
 
-        Their sum stays the same. What the readings told is kept in `showing` of the previous
-        control, and `showing` of the new control gives the new parts, in `current` and `hidden`.
+        A fault may show in the readings under one control and be hidden under another. The present
+        division is kept in `showing` of the previous control; that of the new control is taken from
+        `showing`, and sets `current` and `hidden`. The probability of the fault stays the same.
 
         Parameters
         ----------
@@ -164,8 +165,8 @@ class HypothesisWeights:
         Returns
         -------
         (..., 1 + G K) array
-            By how much the probability rises that there is each fault and it is hidden; 0 where it
-            falls. Faults are in the order of `hidden`.
+            By how much the probability rises that a fault is there and hidden, for each fault in
+            the order of `hidden`; 0 where it falls.
         """
         # joint log probabilities: of the fault and that it shows, and of the fault
         log_fault_and_showing = self.current[..., FAULTS]
@@ -289,7 +290,8 @@ class MixedBelief:
 def mix_beliefs(weights: HypothesisWeights, model_belief: Float, beliefs: Beliefs) -> MixedBelief:
     """Return the beliefs about the state, averaged over all hypotheses but free gains.
 
-    Under free gains no state explains the sensors, so that they add nothing to the belief.
+    The hypothesis of free gains (all gauges have unknown gains) is left out, because it says
+    nothing about the state.
 
     Parameters
     ----------
@@ -312,15 +314,17 @@ def mix_beliefs(weights: HypothesisWeights, model_belief: Float, beliefs: Belief
 
     model_weight = sound_weight[:, MODEL] / total
     right_after_fault = (sound_weight[:, RECOVERED] + hidden_weight) / total
-    competing = np.empty_like(model_belief)
-    average_competing_beliefs(right_after_fault, gauge_weight, beliefs, competing)
-    competing_sum = competing.sum(axis=1)[:, None]
+    competing_belief = np.empty_like(model_belief)
+    average_competing_beliefs(right_after_fault, gauge_weight, beliefs, competing_belief)
+    competing_sum = competing_belief.sum(axis=1)[:, None]
     is_any_competing = competing_sum > 0.0
-    competing = np.where(
-        is_any_competing, competing / np.where(is_any_competing, competing_sum, 1.0), model_belief
+    competing_belief = np.where(
+        is_any_competing,
+        competing_belief / np.where(is_any_competing, competing_sum, 1.0),
+        model_belief,
     )
-    belief = model_weight[:, None] * model_belief + (1.0 - model_weight)[:, None] * competing
-    return MixedBelief(belief, competing, model_weight)
+    belief = model_weight[:, None] * model_belief + (1.0 - model_weight)[:, None] * competing_belief
+    return MixedBelief(belief, competing_belief, model_weight)
 
 
 def list_hypotheses(

@@ -183,7 +183,7 @@ class NoticeWriter:
     def advise_control(
         self, comparison: DiscriminatingControls, controls: tuple[str, ...], step: int
     ) -> Notice:
-        """Return the advice which control discriminates best between two hypotheses of an alarm."""
+        """Return the advice which control best tells the hypotheses of an alarm apart."""
         hypotheses = [
             f"{'the model' if name == 'model' else name} ({probability:.2g})"
             for name, probability in zip(comparison.names, comparison.probabilities, strict=True)
@@ -228,10 +228,11 @@ class NoticeWriter:
     ) -> list[Notice]:
         """Return the alarms that a twin raises in this step, and mark them as raised in `state`.
 
-        Each kind of fault raises its alarm once: a single gauge, or free gains of several. A faulty
-        gauge also raises the evidence for free gains, and a region that softens raises that for its
-        gauges. So the kind with less evidence raises no alarm in the meantime; free gains must be
-        clearly better than a single gauge, the simpler explanation.
+        Two kinds of faults raise an alarm, each once: a fault of a single gauge, and free gains of
+        several gauges. A faulty gauge also increases the evidence for free gains, and a region that
+        softens also that for faults of its gauges. Therefore only the kind with more evidence
+        raises an alarm, and free gains only if they explain the readings clearly better than a
+        fault of a single gauge, which is simpler.
         """
         log_threshold = np.log(self.threshold)
         notices = []
@@ -291,12 +292,18 @@ class NoticeWriter:
         log_evidence: float,
         onset: float,
     ) -> Notice:
-        """Return an alarm.
+        """Return the alarm with a finding, the time of its begin, its evidence, and what to do.
 
         Parameters
         ----------
+        finding : str
+            What was found, as a clause.
         gauges : list of int
             The gauges that the alarm names, from 0.
+        log_evidence : float
+            The log probability of all observations under the fault over that under the model.
+        onset : float
+            The estimated step in which the fault began.
         """
         evidence = float(np.exp(min(log_evidence, _LARGEST_LOG)))
         first_step = round(onset)

@@ -63,7 +63,9 @@ def expectation_of_draws(
     *,
     quantiles: bool = True,
 ) -> Expectation:
-    """Return the expectation under beliefs of a twin that learns nothing: draw weights stay.
+    """Return what a twin that learns nothing expects of sensors and rewards under its beliefs.
+
+    The draws of the calibrated parameter keep their weights.
 
     Parameters
     ----------
@@ -114,7 +116,7 @@ class LearntExpectation:
     def filtered(
         self, carried: Sequence[Carried], beliefs: Float, observations: Float
     ) -> Expectation:
-        """Return the expectation in T steps, each given the observations up to it.
+        """Return the expected sensor values and rewards in T steps, given the observations so far.
 
         Parameters
         ----------
@@ -184,11 +186,11 @@ class LearntExpectation:
         controls: slice,
         observation: Float | None,
     ) -> Expectation:
-        """Return the expectation under B beliefs when only the marginals of a filter are known.
+        """Return the expectation under B beliefs if only the marginals of a filter are known.
 
         The learnt quantities are taken to be independent of each other and of the state. The
-        parameter has two values, one standard deviation on either side of its mean, which are
-        interpolated between the draws.
+        calibrated parameter is represented by two values, one standard deviation on either side of
+        its mean; each is interpolated between two draws.
 
         Parameters
         ----------
@@ -257,7 +259,7 @@ class LearntExpectation:
     def _expect_step(
         self, hypotheses: StaticHypotheses, control_index: int, belief: Float, observation: Float
     ) -> Expectation:
-        """Return the expectation in one step under a known control, without a leading axis.
+        """Return the expected sensor values and rewards in one step, without a leading axis.
 
         Parameters
         ----------
@@ -269,13 +271,13 @@ class LearntExpectation:
         controls = slice(control_index, control_index + 1)
         weight = _joint_with_marginal(hypotheses.weight, belief)[None, :, :, None]
         expectation = self._expect(hypotheses, weight, controls, observation)
-        only_belief = {name: values[0] for name, values in vars(expectation).items()}
-        return Expectation(**only_belief)
+        fields_of_belief = {name: values[0] for name, values in vars(expectation).items()}
+        return Expectation(**fields_of_belief)
 
     def _expect_ahead(
         self, step: Carried, belief: Float, policy: Float, horizon: int
     ) -> Expectation:
-        """Return the expectation in the H steps after one step.
+        """Predict sensor values and rewards in the H steps after one step.
 
         Parameters
         ----------
@@ -399,14 +401,16 @@ def _insert_state_and_control(values: Float) -> Float:
 
 
 def _quantiles_by_state(probability: Float, first_moment: Float, second_moment: Float) -> Float:
-    """Return quantiles (B, 2, G) of mixtures whose components, given state and control, are normal.
+    """Return the lower and upper quantiles (B, 2, G) of G sensors under B beliefs.
+
+    Each sensor value is a mixture with a normal component for each of N states and controls.
 
     Parameters
     ----------
     probability : (B, N) array
         The probability of each pair of a state and a control.
     first_moment, second_moment : (B, N, G) array
-        Moments of each sensor, times that probability.
+        The moments of each component, times its probability.
     """
     quantiles = np.empty((len(probability), len(_LEVELS), first_moment.shape[-1]))
     for b in range(len(probability)):
@@ -452,7 +456,7 @@ def _join_expectations(
 
 
 def mixture_quantiles(weight: Float, mean: Float, deviation: Float, levels: Float) -> Float:
-    """Return quantiles (P, G) of G mixtures of N normal distributions.
+    """Return P quantiles of G mixtures of N normal distributions, a (P, G) array, by bisection.
 
     Parameters
     ----------

@@ -274,8 +274,9 @@ class LearningFilter:
         Returns
         -------
         log_forecast : (K, S) array
-            The log of p(D_t, k | o_0..o_t-1).
+            The log of p(D_t, k | o_0..o_t-1), for K static hypotheses and S states.
         regression_sums : (K, G, 6) array
+            The sums over earlier steps from which the gauge coefficients are fitted.
         count : (G,) array
             The number of earlier observations of each sensor.
         """
@@ -335,7 +336,7 @@ class LearningFilter:
         return np.asarray(self.smoothed_hypotheses(carried).sum(axis=1))
 
     def smoothed_hypotheses(self, carried: Sequence[Carried]) -> Float:
-        """Return the smoothed joint belief over static hypotheses and states.
+        """Return the smoothed joint belief over hypotheses on constant unknowns and over states.
 
         Parameters
         ----------
@@ -404,6 +405,7 @@ class LearningFilter:
         weight : (K,) array
             The probability of each hypothesis.
         regression_sums : (K, G, 6) array
+            The sums over all steps from which the gauge coefficients are fitted.
         count : (G,) array
             The number of observations of each sensor.
         """
@@ -505,22 +507,28 @@ class LearningFilter:
 def _learnt_coefficients(
     name: str, units: Sequence[str], prior_deviation: Float, mean: Float, mean_square: Float
 ) -> dict[str, Learnt]:
-    """Return each gauge's posterior of a coefficient, by `name[g]` with g from 1.
+    """Return the posterior of a coefficient of each gauge, by `name[g]` with g from 1.
 
     Parameters
     ----------
+    units : sequence of str
+        The unit of the coefficient for each gauge.
     prior_deviation : (G,) array
-        The prior standard deviation, in that unit; a gauge with 0 does not learn it.
+        The prior standard deviation, in that unit; a gauge with 0 does not learn the coefficient.
     mean, mean_square : (G,) array
         Posterior moments of the coefficient in prior standard deviations.
     """
     deviation = np.sqrt(np.maximum(mean_square - mean**2, 0.0))
     result = {}
     for g in np.flatnonzero(prior_deviation > 0.0).tolist():
-        center = float(mean[g] * prior_deviation[g])
+        posterior_mean = float(mean[g] * prior_deviation[g])
         standard_deviation = float(deviation[g] * prior_deviation[g])
         half_width = _NORMAL_HALF_WIDTH * standard_deviation
         result[f"{name}[{g + 1}]"] = Learnt(
-            center, standard_deviation, center - half_width, center + half_width, units[g]
+            posterior_mean,
+            standard_deviation,
+            posterior_mean - half_width,
+            posterior_mean + half_width,
+            units[g],
         )
     return result

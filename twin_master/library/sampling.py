@@ -237,9 +237,10 @@ def _library_record(grid: SamplingGrid) -> JsonObject:
 
 
 def _prepare_folder(out: Path, record: JsonObject, *, resume: bool, replace_existing: bool) -> Path:
-    """Return the folder for finished blocks, which may be left from an interrupted sampling.
+    """Prepare the folder for finished blocks of a sampling, and return it.
 
-    An interrupted sampling is continued only if `resume` is set and its record is the same.
+    It may hold blocks of an interrupted sampling, which are kept only if `resume` is set and if the
+    record of that sampling is the same.
     """
     if out.suffix != ".nc":
         raise MissionInputError(

@@ -189,7 +189,7 @@ class Flights:
         self.unexplained[is_flying, beliefs.step] = beliefs.unexplained[is_flying]
 
     def store_history(self, twin: int, history: History) -> None:
-        """Store the steps of one twin."""
+        """Copy the steps that one twin has flown into the arrays of all missions."""
         steps_flown = len(history.steps)
         if steps_flown > 0:
             self.observation_rows[twin, :steps_flown] = history.observation_rows
@@ -210,6 +210,8 @@ def fly_side_by_side(
 ) -> Flights:
     """Fly B missions of one scenario: side by side, or one by one if an asset has a memory.
 
+    Missions that fly side by side make each step together, in groups that fit into memory.
+
     Parameters
     ----------
     knowledge : Knowledge
@@ -225,14 +227,14 @@ def fly_side_by_side(
     """
     if not all(isinstance(asset, StatelessAsset) for asset in assets):
         return fly_one_by_one(knowledge, truths, lambda twin, _previous_ended_well: assets[twin])
-    size = len(truths)
+    group_size = len(truths)
     watch = gauge_watch_of(knowledge.estimator)
     if watch is not None:
-        size = max(1, _MOST_NUMBERS_TOGETHER // watch.faults.belief_size)
+        group_size = max(1, _MOST_NUMBERS_TOGETHER // watch.faults.belief_size)
     formations = []
-    for first in range(0, len(truths), size):
-        truth = Truth.stack(truths[first : first + size])
-        plant = knowledge.plant(truth, *assets[first : first + size])
+    for first in range(0, len(truths), group_size):
+        truth = Truth.stack(truths[first : first + group_size])
+        plant = knowledge.plant(truth, *assets[first : first + group_size])
         formations.append(fly_formation(knowledge, plant, plant))
     return Flights.concatenate(formations)
 

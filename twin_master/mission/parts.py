@@ -265,7 +265,7 @@ def description(part: object) -> str:
 
 
 def object_by_name(role: str, name: str) -> object:
-    """Return the object with a name.
+    """Load a part of a twin that a user has given by name.
 
     Parameters
     ----------

@@ -113,9 +113,10 @@ class Truth:
     def _apply_faults(self, scenario: Scenario) -> None:
         """Set `status` and `drift` in the steps and sensors of the scenario's sensor faults."""
         steps = np.arange(scenario.mission.steps)
-        hidden_first = [*_STATUS_OF_FAULT]
+        # Where several faults meet, the one whose kind comes last in this list sets the status.
+        kinds_in_order = [*_STATUS_OF_FAULT]
         faults = scenario.truth.sensor_faults
-        for fault in sorted(faults, key=lambda fault: hidden_first.index(fault.kind)):
+        for fault in sorted(faults, key=lambda fault: kinds_in_order.index(fault.kind)):
             last_step = fault.last_step if fault.last_step is not None else scenario.mission.steps
             is_active = (steps >= fault.first_step) & (steps <= last_step)
             sensors = np.array(fault.sensor_indices(scenario.observation.count))
@@ -230,7 +231,7 @@ class Truth:
         for reading in self._inspections:
             is_asked_for = control == reading.control_index
             columns.append(np.where(is_asked_for, state[..., reading.state_index], np.nan))
-        # The shape is given because there may be no inspections.
+        # (I, ...); the shape is stated because there may be no inspections
         by_inspection = np.reshape(columns, (len(columns), *state.shape[:-1]))
         return np.asarray(np.moveaxis(by_inspection, 0, -1) + self.reading_noise[step])
 
@@ -265,10 +266,11 @@ class DamageGrowth:
         if control is None or state is None:
             return _draw(self._initial, uniform)
         next_states = np.empty_like(state)
-        # Missions with the same control in the same state are drawn together.
-        code = control * self._model.states.size + state
-        for pair_code in np.unique(code).tolist():
-            has_code = code == pair_code
+        # Missions with the same control in the same state are drawn together. A pair of control and
+        # state is coded as one number.
+        pair_codes = control * self._model.states.size + state
+        for pair_code in np.unique(pair_codes).tolist():
+            has_code = pair_codes == pair_code
             next_states[has_code] = _draw(self._states_after(pair_code), uniform[has_code])
         return next_states
 
@@ -466,10 +468,10 @@ class Plant(Source[DecidingTwins]):
     def _read_asset(
         self, mission: int, missions: Index, control: Index, state: TrueState
     ) -> AssetReading:
-        """Return the reading of a mission's asset, which other missions share.
+        """Return the reading of the asset of one mission, which the `missions` share.
 
-        If the asset fails, the error is kept in `failures` for all of them. If none of them flies,
-        nothing is read.
+        If the asset fails, all of these missions end, with the error in `failures`. If `missions`
+        is empty, the asset is not read, and the values are NaN.
         """
         no_reading = AssetReading(np.full(self._scenario.observation.count, np.nan))
         if len(missions) == 0:
@@ -498,7 +500,7 @@ class Plant(Source[DecidingTwins]):
         return reading
 
     def _checked_values(self, reading: AssetReading, control_index: int) -> Float:
-        """Return the observation (G,) of an asset in this step, SI.
+        """Return the observed values (G,) in a reading of an asset, SI, after a check.
 
         Raises
         ------

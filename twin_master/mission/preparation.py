@@ -430,8 +430,8 @@ def _inspected_sensor_model(
     within_level = np.zeros_like(coordinates)
     if scenario.observation.between_levels:
         # The standard deviation of each factor inside the interval that its level stands for. The
-        # last axes of the changes are the factor that changes and the factor that is moved, and a
-        # factor changes only with itself: the diagonal.
+        # changes are (S, F, F): of each factor (second axis), if a factor (third axis) is off its
+        # level. A factor changes only with itself, on the diagonal.
         within_level = np.einsum("sff->sf", model.states.change_within_interval(coordinates))
     return partial(
         InspectedSensorModel,
@@ -448,7 +448,7 @@ def prepare_knowledge(
     policy: Float | BeliefPolicy | None = None,
     parts: TwinParts = NO_PARTS,
 ) -> Knowledge:
-    """Return the knowledge of a twin: calibrated draws, and predictions by state and control.
+    """Prepare what a twin knows: calibrated draws, and predictions by draw, state and control.
 
     Kapteyn et al. 2021, eq. (30). The plan, eq. (36), is made when it is first used.
 

@@ -56,9 +56,9 @@ def _decode(line: bytes) -> JsonObject | None:
 
 
 def _size_to_keep(path: Path, step: int, line_hash: bytes) -> int:
-    """Return the size of the parts in a file that belong to lines before the one to be written.
+    """Return how many bytes of a file of parts belong to lines before the one to be written.
 
-    Parts of this line or of later steps are left from a process that was killed before it wrote
+    The parts after them are cut off: they are left from a process that was killed before it wrote
     their lines, or their lines were dropped.
     """
     size = 0

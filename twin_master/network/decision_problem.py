@@ -107,12 +107,12 @@ def observation_classes(
     generator: np.random.Generator,
     classes: int = MOST_CLASSES,
 ) -> tuple[Float, ...]:
-    """Return p(class of the observation | state) (K, S) for each control.
+    """Divide observations into K classes; return p(class | state) (K, S) for each control.
 
-    Observations are drawn in each state. Those whose posteriors, from a uniform prior, are close in
-    Hellinger distance are joined to one of K classes. The probability of a class in a state is the
-    sum of the posteriors of its members, normalised over the classes. The number of classes is
-    doubled until they contain nearly as much information about the state as all observations.
+    Observations are drawn in each state. Observations with similar posteriors (from a uniform
+    prior, by the Hellinger distance) form a class. The probability of a class in a state is the sum
+    of the posteriors of its members, normalised over the classes. K is doubled until the classes
+    contain nearly as much information about the state as all observations.
 
     Parameters
     ----------
@@ -138,7 +138,7 @@ def observation_classes(
 
 
 def _join_similar(posterior: Float, generator: np.random.Generator, classes: int) -> Float:
-    """Return the sum of the posteriors in each class of similar ones: (N, S) -> (K, S).
+    """Divide N posteriors (N, S) into K classes of similar ones; return their sums (K, S).
 
     The classes are found by k-means; their number K is at most `classes`.
     """

@@ -426,7 +426,7 @@ def repaired_table(table: Float, success: float) -> Float:
 def leaving_table(table: Float, factor: float) -> Float:
     """Multiply each probability of leaving a level by a factor; return the transition table (L, L).
 
-    The probability of staying at the level becomes the rest to one.
+    The probability of staying at a level changes so that each row still sums to one.
 
     Raises
     ------

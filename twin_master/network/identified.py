@@ -39,14 +39,16 @@ class IdentifiedSensorModel(GaussianSensorModel):
         return rows, np.zeros((*rows.shape[:-1], self.state_count))
 
     def noise(self, joint: ArrayLike, rows: Float | None = None) -> Float:
-        """Return the standard deviation (..., G) of each sensor, SI, with the variance in its row.
+        """Return the standard deviation (..., G) of the noise of each sensor, SI.
+
+        It combines the assumed noise and the variance that comes with an observation.
 
         Parameters
         ----------
         joint : (..., S, U) array
             The joint beliefs over states and controls.
         rows : (..., G + G (G + 1) / 2) array, optional
-            The observed values with their covariances.
+            The observed values, each row with the lower triangle of its covariance matrix.
         """
         assumed = super().noise(joint)
         if rows is None:
@@ -79,7 +81,10 @@ class IdentifiedSensorModel(GaussianSensorModel):
         return np.asarray(average)
 
     def _log_density_of_row(self, observation: Float, control_index: int) -> Float:
-        """Return the log density (S, E) of one row by state and draw."""
+        """Return the log density (S, E) of one observation in S states, for each of E draws.
+
+        The row has the G values and the lower triangle of their covariance matrix.
+        """
         row = np.array(observation, dtype=np.float64)
         count = self.sensor_count
         values = self.check_observation(row[:count])

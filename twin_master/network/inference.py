@@ -95,7 +95,7 @@ class Predicted:
 def checked_sequence(
     model: GraphicalModel, control_index: ArrayLike, log_rows: ArrayLike, *, what: str
 ) -> tuple[Index, Float]:
-    """Return checked controls (1, T) and logarithms (1, T, S), as the compiled loops expect them.
+    """Check controls and logarithms of a sequence; return them as the compiled loops expect them.
 
     Parameters
     ----------
@@ -107,6 +107,11 @@ def checked_sequence(
         A logarithm for each step and state.
     what : str
         The noun of the rows, for the message.
+
+    Returns
+    -------
+    control : (1, T) array
+    rows : (1, T, S) array
 
     Raises
     ------
@@ -196,7 +201,7 @@ def smooth_many(
     filtered_beliefs: Float,
     log_filtered_beliefs: Float,
 ) -> Float:
-    """Smooth the beliefs (B, T, S) of B twins under controls (B, T); arguments are not checked."""
+    """Smooth the beliefs (B, T, S) of B twins under controls (B, T), without checks."""
     smoothed_beliefs = np.empty_like(log_filtered_beliefs)
     backward_pass(
         transition.forward_lists,

@@ -184,10 +184,10 @@ class Hold:
     def apply(
         self, probability: Float, control: Index, proposals_before: Index
     ) -> tuple[Float, Index]:
-        """Return the probabilities of the next controls (B, U), and the proposals in a row (B,).
+        """Hold back changes to harder controls that were not yet proposed often enough in a row.
 
-        As long as a change to a harder control is held, the probabilities of all harder controls
-        are added to that of the control in force.
+        As long as a change is held back, the probabilities of all harder controls are added to that
+        of the control in force.
 
         Parameters
         ----------
@@ -197,6 +197,13 @@ class Hold:
             The indices of the controls in force.
         proposals_before : (B,) array
             How often in a row a harder control than the one in force was proposed before.
+
+        Returns
+        -------
+        probability : (B, U) array
+            The probability of each next control.
+        proposals : (B,) array
+            How often in a row a harder control was proposed, this step included.
         """
         hardness_in_force = self.hardness[control]
         is_harder = self.hardness > hardness_in_force[:, None]  # (B, U)
@@ -377,7 +384,10 @@ class _DecisionProcess:
         policy: Float | None = None,
         start: Float | None = None,
     ) -> _ValueIteration:
-        """Iterate the Bellman equation until the value is known to a tolerance, or to rounding.
+        """Compute the value of the best, or of a given, policy by sweeps of the Bellman equation.
+
+        The sweeps end when the value is known to a tolerance or to rounding, or after
+        `most_sweeps`.
 
         Parameters
         ----------
@@ -481,7 +491,9 @@ class _DecisionProcess:
         return np.asarray(np.linalg.solve(np.eye(states) - discounted, reward))
 
     def improve_policy(self, control: Index, start: Float) -> tuple[Index, Float]:
-        """Return the best controls (S,) and their value (S,), by policy iteration (Howard 1960).
+        """Find the best control in each state by policy iteration (Howard 1960).
+
+        Returns the controls (S,) and their value (S,).
 
         Parameters
         ----------
@@ -491,8 +503,8 @@ class _DecisionProcess:
             An estimate of their value.
         """
         states = np.arange(len(control))
-        certain = np.eye(len(self.discount))  # rows are policies that take one control for certain
-        value = self.evaluate(certain[control], start)
+        one_hot = np.eye(len(self.discount))  # rows are policies that take one control for certain
+        value = self.evaluate(one_hot[control], start)
         while True:
             action_value = self.action_value(value)
             gain = action_value.max(axis=1) - action_value[states, control]
@@ -500,7 +512,7 @@ class _DecisionProcess:
             better_control = np.where(is_gain_real, np.argmax(action_value, axis=1), control)
             if np.array_equal(better_control, control):
                 return control, value
-            better_value = self.evaluate(certain[better_control], value)
+            better_value = self.evaluate(one_hot[better_control], value)
             if not better_value.sum() > value.sum():  # an improvement by rounding alone
                 return control, value
             control = better_control
@@ -577,7 +589,7 @@ def value_iteration(
 def evaluate_policy(
     transition: TransitionModel, reward: ArrayLike, discount: ArrayLike, policy: Float
 ) -> PlannedPolicy:
-    """Return a given policy with its value, as if it had been planned.
+    """Compute the value of a given policy, and return both as if the policy had been planned.
 
     Parameters
     ----------

@@ -186,8 +186,8 @@ class QuantityModel:
         mean = product_of_each(weight, mean_table)
         variance = np.empty_like(mean)
         for row, weight_of_pairs in enumerate(weight):
-            # Variance within a pair of state and control, plus that of the means. The latter is
-            # centred: a certain belief gives the variance of the draws without cancellation.
+            # Law of total variance: variance within each pair of state and control, plus that of
+            # the means. Distances from the mean are squared, so that no differences cancel.
             squared_distance = (mean_table - mean[row]) ** 2
             variance[row] = weight_of_pairs @ (variance_table + squared_distance)
         shape = (*joint.shape[:-2], self.sensor_count)
@@ -226,11 +226,11 @@ class QuantityModel:
 def _error_moments(
     observation: Float, mean: Float, variance: Float, scale: Float
 ) -> tuple[Float, Float]:
-    """Return mean and variance (...) of the error reward.
+    """Return mean and variance (...) of the error reward for uncertain sensor values.
 
     The reward is minus the mean, over the present sensors, of |observation - value| / scale. The
-    values are independently normal, so that each distance has a folded normal distribution (Leone,
-    Nelson and Nottingham 1961).
+    values are normal and independent, so that each |observation - value| has a folded normal
+    distribution (Leone, Nelson and Nottingham 1961).
 
     Parameters
     ----------
@@ -265,7 +265,7 @@ def _error_moments(
 def _error_rewards(observation: Float, value: Float, scale: Float) -> Float:
     """Return the error reward (...) for known sensor values.
 
-    It is the mean of `_error_moments` for a variance of zero, without the distribution functions.
+    It equals the mean that `_error_moments` returns for a variance of zero, and is faster.
 
     Parameters
     ----------
@@ -435,9 +435,10 @@ class RewardModel:
         variance: Float,
         observation: Float | None = None,
     ) -> tuple[Float, Float]:
-        """Return mean and standard deviation of each reward (B, 3) for a learning filter.
+        """Return mean and standard deviation (B, 3) of each reward for a twin that learns.
 
-        Each belief is over K static hypotheses, S states and U' of the controls together.
+        Each belief is a joint one over K hypotheses on constant unknowns, S states and U' of the
+        controls.
 
         Parameters
         ----------

@@ -36,7 +36,7 @@ some microseconds."""
 
 
 def stochastic_matrix(rows: ArrayLike, *, name: str) -> Float:
-    """Return rows of probabilities as a checked, read-only array.
+    """Check rows of probabilities, and return them as a read-only array.
 
     Parameters
     ----------
@@ -67,7 +67,7 @@ def stochastic_matrix(rows: ArrayLike, *, name: str) -> Float:
 
 
 def _check_rows(matrix: Float, is_wrong: NDArray[np.bool_], name: str, fault: str) -> None:
-    """Refuse a matrix (..., n) if some of its rows (...) are wrong, and name the first of them."""
+    """Refuse a matrix (..., n) if `is_wrong` (...) is true for a row; name the first such row."""
     if not np.any(is_wrong):
         return
     if matrix.ndim == 1:
@@ -185,10 +185,10 @@ def check_fits(parts: Mapping[str, float], advice: str) -> None:
     needed_memory = sum(parts.values())
     available = available_memory()
     if needed_memory > available:
-        listed = ", ".join(f"{size / 1e9:.3g} GB for {what}" for what, size in parts.items())
+        list_of_sizes = ", ".join(f"{size / 1e9:.3g} GB for {what}" for what, size in parts.items())
         raise InvalidModelError(
-            f"this does not fit in memory: {listed}, together {needed_memory / 1e9:.3g} GB, and "
-            f"{available / 1e9:.3g} GB are left: {advice}."
+            f"this does not fit in memory: {list_of_sizes}, together {needed_memory / 1e9:.3g} GB, "
+            f"and {available / 1e9:.3g} GB are left: {advice}."
         )
 
 
@@ -198,11 +198,11 @@ def transition_bytes(states: int, controls: int) -> float:
 
 
 def predecessor_lists(blocks: Sequence[Float]) -> PredecessorLists:
-    """Return the non-zero transitions of several blocks as sparse rows (the CSR format).
+    """Return the non-zero transitions of several blocks in one sparse matrix (format CSR).
 
-    There is a row for each block, control and next level, in this order. It lists the levels from
-    which the next level is reached in one step. The rows of all blocks are in the same arrays:
-    `first_row` has the first row of each block, and `start` the first entry of each row.
+    The matrix has a row for each block, control and next level, in this order. The row lists the
+    levels from which the next level is reached in one step. `first_row` is the index of the first
+    row of each block, and `start` that of the first entry of each row.
 
     Parameters
     ----------

@@ -73,12 +73,12 @@ def default_present_row(run: Run) -> int:
 
 
 def choose_sensors(run: Run, count: int = 4) -> list[int]:
-    """Return the indices of the sensors that the mission's figure shows by default.
+    """Choose the sensors that the figure of a mission shows by default; return their indices.
 
     These are the sensor with the largest expected value, the first sensor, and for each factor of
-    the state the sensor, not yet chosen, that responds most to it. The last ones need expected
-    values above 0, of which logarithms are taken. If the sensors have different units, the first
-    `count` sensors are returned.
+    the state the sensor that responds most to it among the others. The response is the change of
+    the logarithm, so that it counts only if all expected values are positive. If the sensors have
+    different units, the first `count` sensors are returned.
 
     Parameters
     ----------
@@ -174,7 +174,7 @@ def _panels_in_columns(run: Run, sensors: Sequence[int]) -> tuple[list[Panel], l
 def _draw_zones(axes: Axes, run: Run, present_row: int, *, with_headings: bool) -> None:
     """Set up the axes of a panel, and mark the present step and the zone of predicted steps.
 
-    With headings, the zones are named above the panel if they are wide enough.
+    `with_headings` also writes "now", "past" and "prediction" above zones that are wide enough.
     """
     first_step = run.first_step
     present_step = first_step + present_row

@@ -39,7 +39,7 @@ FIGURE_FOLDER = "figures"
 
 
 def write_report(run_folder: Path | str, *, now: int | None = None) -> Path:
-    """Write ``report.html`` and ``figures/`` of a run.
+    """Write the report of a run: ``report.html`` and the folder ``figures``.
 
     Equal runs give equal bytes, because the report contains no wall-clock times; these are in
     ``timing.json``.
@@ -122,7 +122,7 @@ def _figures(run: Run, now: int | None, folder: Path) -> Iterator[ReportFigure]:
 
 
 def _present_row(run: Run, now: int | None) -> int:
-    """Return the row of the step with the number `now`, or else with `default_present_row`.
+    """Return the row of the step with the number `now`; by default, `default_present_row` decides.
 
     Raises
     ------
@@ -217,7 +217,11 @@ def run_page(run: Run, figures: Mapping[str, PageFigure]) -> Page:
 
 
 def _notices(run: Run) -> list[Block]:
-    """Return what a reader must not overlook: differences of asset and model, notices, losses."""
+    """Return the notices of a report: what its reader must not overlook.
+
+    They are a difference of asset and model, the notices of the twin, a true parameter that
+    contradicts the calibration, and lost observations.
+    """
     notices: list[Block] = []
     if run.summary.get("asset_and_model_differ"):
         sentence = (

@@ -185,10 +185,10 @@ def _draw_wing(
     value_label: str,
     look: style.ColorScale,
 ) -> None:
-    """Draw a wing from above: its regions coloured by expected loss, its gauges by values (G,).
+    """Draw a wing from above, its regions coloured by expected loss, its gauges by values (G,).
 
-    The scales of the colours lie below the wing: of the losses on the left, of the values on the
-    right.
+    The colour bars are below the wing: that of the losses on the left, that of the values on the
+    right. `look` holds the colours of the values, as arguments of `Axes.scatter`.
     """
     x, y = planform.outline.T
     axes.fill(x, y, facecolor="#f2f4f6", edgecolor=style.REFERENCE)
@@ -220,9 +220,8 @@ def _draw_gauges(
 ) -> PathCollection:
     """Draw gauges at positions (G, 2) as dots coloured by values (G,), and return the dots.
 
-    A gauge whose value is NaN, because its reading was lost, is a cross.
-
-    `look` holds the colours of the values, as arguments of `Axes.scatter`.
+    A gauge with a lost reading (NaN) is a cross. `look` holds the colours of the values, as
+    arguments of `Axes.scatter`.
     """
     is_known = np.isfinite(values)
     x, y = positions[is_known].T
@@ -331,9 +330,11 @@ def mesh_figure(run_folder: Path, residual: Float) -> StructurePicture:
     """
     field = read_field(run_folder / FIELD_NAME)
     points = field.body.points
-    largest = float(np.linalg.norm(field.displacement, axis=1).max())
+    largest_displacement = float(np.linalg.norm(field.displacement, axis=1).max())
     diagonal = float(np.linalg.norm(np.ptp(points, axis=0)))
-    scale = _DRAWN_DISPLACEMENT * diagonal / largest if largest > 0.0 else 0.0
+    scale = (
+        _DRAWN_DISPLACEMENT * diagonal / largest_displacement if largest_displacement > 0.0 else 0.0
+    )
     displaced_points = np.asarray(points + scale * field.displacement)
     camera = structure_camera()
     figure, ((axes,),) = style.panels(
@@ -354,7 +355,7 @@ def mesh_figure(run_folder: Path, residual: Float) -> StructurePicture:
     axes.axis("off")
     label = "stiffness loss (%)"
     style.color_bar(figure, surface, label, ax=axes, location="left", **_COLOR_BAR)
-    return StructurePicture(figure, largest, scale)
+    return StructurePicture(figure, largest_displacement, scale)
 
 
 def _draw_surface(

@@ -46,7 +46,10 @@ def summary_table(run: Run) -> Table:
 
 
 def learnt_asset_table(run: Run) -> Table:
-    """Return the table of what was learnt of the asset: prior, last posterior, true value."""
+    """Return the table of the quantities of the asset that the twin learnt.
+
+    It has the prior, the posterior after the last step and, in a simulation, the true value.
+    """
     quantities = quantities_of_asset(run)
     has_truth = any(quantity.truth is not None for quantity in quantities)
     columns = [

@@ -167,8 +167,8 @@ def load_scenario(scenario_or_file: LoadedScenario | str | Path) -> LoadedScenar
     """Read and check a scenario file, and switch the alarms of its twin on by default.
 
     A file without the key `notice` gets the default table `notice`, unless `obstacle_to_notices`
-    names a reason against it; the reason is then the remark of the result. The scenario of a past
-    run (`config.json`) is read by `parse_scenario` instead, which adds no defaults of this kind.
+    gives a reason against it, which then is the remark of the result. (The scenario of a past run,
+    in `config.json`, is read by `parse_scenario` alone, which adds no such default.)
 
     Parameters
     ----------

@@ -148,7 +148,10 @@ class Section(toml_file.Section):
 
 
 def _add_keys_with_units(table: Table, units: Mapping[str, str]) -> None:
-    """Add keys with units in their names to the JSON Schema of a table."""
+    """Add to the JSON Schema of a table the keys that have a unit in their names.
+
+    `units` has the unit of each key that has one; a key `length` in mm gives `length_mm`.
+    """
     properties: Table = {}
     alternatives = []
     for key, key_schema in table["properties"].items():
@@ -174,7 +177,7 @@ def _relax_required_keys(table: Table, keys: set[str]) -> None:
 
 
 def _schema_in_unit(schema: JsonDocument, divisor: float) -> JsonDocument:
-    """Convert the JSON Schema of a value in SI to one of the value in a unit.
+    """Convert the limits in the JSON Schema of a value from SI to another unit.
 
     Parameters
     ----------

@@ -36,7 +36,7 @@ _MOMENT_TITLES = ("mean", "standard deviation", "5 % quantile", "95 % quantile")
 
 
 def run_groups(result: MissionResult) -> dict[str, NetcdfGroup]:
-    """Return the groups of `run.nc` of a mission; every variable has its unit and a description."""
+    """Return the contents of `run.nc` by group; each variable has its unit and a description."""
     scenario = result.scenario
     flight = result.flight
     plan = result.knowledge.plan
@@ -129,7 +129,7 @@ def _filtered_variables(result: MissionResult) -> dict[str, ArrayLike]:
 
 
 def _predicted_variables(result: MissionResult) -> dict[str, ArrayLike]:
-    """Return the predicted belief, whose leading axes are step and horizon.
+    """Return the variables of the group `predicted`, whose leading axes are step and horizon.
 
     A twin that adopts a patched model has different knowledge in different spans of its steps: the
     expectations are computed for each span and concatenated.
@@ -151,7 +151,7 @@ def _predicted_variables(result: MissionResult) -> dict[str, ArrayLike]:
 
 
 def _expected_in_flight(result: MissionResult, belief: Float, *, is_smoothed: bool) -> Expectation:
-    """Return the expected sensors and rewards of each step, by the model believed then.
+    """Return the expected sensor values and rewards of each step, by the model believed then.
 
     Parameters
     ----------

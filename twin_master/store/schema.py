@@ -140,8 +140,8 @@ def described_variables(
 ) -> dict[str, Variable]:
     """Return the variables of a group of `run.nc` by their paths.
 
-    Fields in braces of the schema are filled with those of the mission, of the group, and of the
-    entry; a later one replaces an earlier one of the same name.
+    Names and attributes in the schema have fields in braces. They are filled with the given
+    `fields`, those of the group and those of the entry; of one name, the last of these holds.
     """
     rows = rows_of_group(group)
     variables = {}
@@ -192,7 +192,7 @@ def coordinate_variables(
 def in_groups(
     variables: Mapping[str, Variable], coordinates: Mapping[str, Variable]
 ) -> dict[str, NetcdfGroup]:
-    """Return variables in their groups, each group with the coordinates whose axes it has.
+    """Sort variables into their groups, each with the coordinates along the axes that it has.
 
     Parameters
     ----------

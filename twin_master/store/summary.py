@@ -195,7 +195,7 @@ class PolicySwitch(NamedTuple):
 def find_policy_switch(
     states: StateSpace, policy_index: Index, first_control: int
 ) -> PolicySwitch | None:
-    """Return the level of a state factor from which on a policy leaves its first control.
+    """Find the level of a state factor at and above which a policy leaves its first control.
 
     The result is None if the policy never leaves it, depends on several factors, or returns to the
     first control at a higher level of the factor.
@@ -207,12 +207,14 @@ def find_policy_switch(
     first_control : int
         The index of the first control.
     """
-    leaves = (policy_index != first_control).reshape(states.shape)  # an axis for each factor
+    leaves_first_control = (policy_index != first_control).reshape(
+        states.shape
+    )  # an axis for each factor
     for axis, factor in enumerate(states.factors):
         # The policy depends on this factor alone if at each of its levels all states agree
-        other_axes = tuple(index for index in range(leaves.ndim) if index != axis)
-        leaves_somewhere = leaves.any(axis=other_axes)
-        leaves_everywhere = leaves.all(axis=other_axes)
+        other_axes = tuple(index for index in range(leaves_first_control.ndim) if index != axis)
+        leaves_somewhere = leaves_first_control.any(axis=other_axes)
+        leaves_everywhere = leaves_first_control.all(axis=other_axes)
         depends_on_factor_alone = np.array_equal(leaves_somewhere, leaves_everywhere)
         level = _first_true(leaves_everywhere)
         if depends_on_factor_alone and level is not None and leaves_everywhere[level:].all():
@@ -237,7 +239,7 @@ def summarise(
     misfit: Float | None = None,
     first_groups: Iterable[SummaryGroup] = (),
 ) -> Iterator[SummaryEntry]:
-    """Yield the results of a mission; the same seed gives the same results.
+    """Yield the results of a mission for its summary, with reference values where there are any.
 
     Parameters
     ----------
@@ -264,8 +266,8 @@ def summarise(
     groups += _suspicion_groups(result)
     references = {reference.figure: reference for reference in result.scenario.reference}
     if result.flight.simulated:
-        promise = return_reference(result.knowledge)
-        references = {entry.figure: entry for entry in promise} | references
+        planned_references = return_reference(result.knowledge)
+        references = {entry.figure: entry for entry in planned_references} | references
     for group in groups:
         texts = SUMMARY_TITLES[group.name]
         for (key_template, (title, unit)), value in zip(texts.items(), group.values, strict=True):
@@ -364,8 +366,8 @@ def _suspicion_groups(result: MissionResult) -> Iterator[SummaryGroup]:
 def _parameter_groups(result: MissionResult) -> Iterator[SummaryGroup]:
     """Yield mean and standard deviation of the calibrated parameter.
 
-    If the parameter is learnt in the flight, they are given after and before the flight, and the
-    true value is given if it is known; else only before the flight.
+    If the parameter was learnt in flight, these are the moments after and before the flight, with
+    the true value if it is known; otherwise only those before the flight.
     """
     draws = result.knowledge.draws
     title = parameter_title(draws.name)
@@ -516,7 +518,8 @@ def control_changes(
 def fallback_group(fallback: Fallback, scenario: Scenario) -> SummaryGroup:
     """Return level, steps and delay of a fallback as a group of the summary.
 
-    A single entry says so if the policy depends on no state factor, or on several.
+    If the policy does not depend on exactly one state factor, the group has a single entry that
+    says so.
     """
     level = fallback.switch_level
     first_control = scenario.mission.first_control

@@ -67,9 +67,9 @@ def write_run(
 
 
 def open_run(folder: Path | str) -> "DataTree":
-    """Return the groups of `run.nc` in a run folder, loaded into memory.
+    """Read the groups of `run.nc` in a run folder into memory.
 
-    A folder that was being replaced when its process was killed is restored first.
+    If a process was killed while it replaced the folder, the former folder is restored first.
 
     Raises
     ------
@@ -188,8 +188,8 @@ def _summary_heading(result: MissionResult, origin: AssetAndModel, steps: int) -
 def printed_values(entries: Sequence[SummaryEntry]) -> list[tuple[str, str]]:
     """Return value and reference of each entry as texts; a missing reference is empty.
 
-    A number has three significant digits. A mean whose standard deviation is an entry, too, has the
-    decimals of that deviation, so that both can be compared.
+    A number has three significant digits. If the standard deviation of a mean is another entry, the
+    mean has as many decimals as it, so that both can be compared.
     """
     values = {entry.key: entry.value for entry in entries}
     texts = []

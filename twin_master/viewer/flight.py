@@ -93,8 +93,6 @@ def find_force_drawing(step: int, verdict_folder: Path) -> ForceDrawing | None:
     ----------
     step : int
         The step after which the verdict came.
-    verdict_folder : Path
-        The folder of the verdict.
 
     Returns
     -------
@@ -422,7 +420,7 @@ class Flight:
     def _expectation_with_learning(
         self, expectation: LearntExpectation, joint: Float, records: Sequence[StepRecord]
     ) -> Expectation:
-        """Return the sensors and rewards that a learning twin expected in each of n steps.
+        """Return the sensor values and rewards that a learning twin expected in each of n steps.
 
         Parameters
         ----------

@@ -320,7 +320,7 @@ class FlightPage:
 
 
 def _page_of_scene(scene: Mapping[str, Any]) -> Page:
-    """Return the page of a flight, whose elements the script fills from the scene and the answers.
+    """Return the page of a flight with empty elements, which the script of the page fills.
 
     `scene` has all that does not change during a flight, as plain JSON.
     """

@@ -119,7 +119,7 @@ def resume_watch(
     *,
     fleet_is_locked: bool = False,
 ) -> Iterator[Watch]:
-    """Provide the watch in an existing folder while the folder is locked.
+    """Provide the watch that is to be continued in a folder, and lock the folder meanwhile.
 
     Parameters
     ----------
@@ -158,11 +158,11 @@ def resume_watch(
 def copy_of_run_until(
     folder: Path, first: int | None, last: int | None, progress: Progress
 ) -> Iterator[Path]:
-    """Provide a run folder with results up to a step.
+    """Provide a folder with the results of a run or a watch up to a step.
 
-    The folder of a run is given as it is. A watch may still go on and may have no results yet: a
-    temporary copy of its folder is given instead, with the journal up to the last step and the
-    results of these steps. The copy is removed at the end of the context.
+    The folder of a run is provided as it is. A watch may still go on and have no results yet:
+    instead of its folder, a temporary copy is provided, with the journal up to the last step and
+    the results of these steps. The copy is removed at the end of the context.
 
     Parameters
     ----------
@@ -201,10 +201,10 @@ def copy_of_run_until(
 
 
 def open_run(folder: Path | str) -> xr.DataTree:
-    """Return everything that a run or a watch left, `run.nc`, as labelled arrays in memory.
+    """Read all results of a run or a watch (`run.nc`) as labelled arrays in memory.
 
-    A watch that goes on, or was killed, is read as it would be if it had ended after the last step
-    of its journal. Its folder is not changed.
+    A watch that still goes on, or was killed, is read as if it had ended after the last step of its
+    journal. Its folder is not changed.
 
     Parameters
     ----------
@@ -396,7 +396,10 @@ def _also_for_monitoring(
     line_protocol: Path | str | None,
     watched: Watch,
 ) -> DecisionSink:
-    """Return a sink that also serves each decision as metrics, and appends it to a file."""
+    """Extend the receiver of decisions: also serve each as metrics, and append it to a file.
+
+    `server` and `line_protocol` are None if this is not wanted.
+    """
     name = watched.scenario.mission.name
     sinks = [decide]
     if server is not None:

@@ -131,7 +131,10 @@ class TransitionFamily:
 
     @classmethod
     def learnable(cls, scenario: Scenario) -> "TransitionFamily":
-        """Return the transitions of a scenario of the kind `independent_worsening`."""
+        """Return the transitions of a scenario as functions of its probabilities of worsening.
+
+        The transition of the scenario is of the kind `independent_worsening`.
+        """
         probabilities = _assumed_probabilities(scenario)
         # Each entry is a linear function of its probability p. Its values at p = 1/4 and 3/4
         # determine slope and ends. At p = 0 or 1 the lists would lack the entries that are zero.
@@ -187,10 +190,10 @@ def _predecessors_at(scenario: Scenario, probability: float) -> PredecessorLists
 
 
 def _parameter_index(scenario: Scenario, causes: list[_Cause], lists: PredecessorLists) -> Index:
-    """Return the index of the cause on whose probability each entry of the lists depends.
+    """Return for each non-zero transition in the lists the index of its cause.
 
-    The result is a (non-zeros,) array. Rows of the lists are ordered by factor, then by control,
-    then by level.
+    A cause is a control with a factor, or a control alone, that has a probability of worsening of
+    its own. The rows of the lists are ordered by factor, then by control, then by level.
     """
     levels_of_factors, _, start, _, _, _ = lists
     index_of_rows = []
@@ -226,12 +229,12 @@ def scaled(log_likelihood: Float) -> tuple[Float, Float]:
 def transition_evidence(
     family: TransitionFamily, points: Float, log_likelihood: Float, control: Index
 ) -> Float:
-    """Return the log evidence of B twins for P values of the probabilities of worsening.
+    """Return the log evidence of B twins at P points: sets of values of the K probabilities.
 
     Parameters
     ----------
     points : (P, K) array
-        The probabilities, between 0 and 1.
+        The probabilities with which damage grows, between 0 and 1.
     log_likelihood : (B, T, S) array
         log p(o_t | D_t, u_t).
     control : (B, T) array
@@ -250,7 +253,10 @@ def transition_evidence(
 
 
 def sub_grids(family: TransitionFamily, axes: Axes) -> SubGrids:
-    """Return the grid of K axes of probabilities of worsening, with the transitions at its points.
+    """Return the grids of all subsets of the K probabilities, with the transitions at their points.
+
+    The transition of a control depends only on some of the probabilities; the grid of this subset
+    has far fewer points than that of all.
 
     Parameters
     ----------
@@ -284,17 +290,17 @@ def sub_grids(family: TransitionFamily, axes: Axes) -> SubGrids:
 
 
 def grid_evidence(family: TransitionFamily, axes: Axes, likelihood: Float, control: Index) -> Float:
-    """Return the log evidence of B twins on a tensor grid of the probabilities of worsening.
+    """Return the log evidence of B twins on a tensor grid of K probabilities of worsening.
 
-    It is that of `transition_evidence` at the points of the grid, to rounding, but for a constant
-    of each twin: the `log_scale` of its likelihood.
+    At the points of the grid it equals that of `transition_evidence`, to rounding, without the
+    `log_scale` of each twin's likelihood, which is a constant.
 
     Parameters
     ----------
     axes : tuple of (N,) array
         The values of each probability, between 0 and 1.
     likelihood : (B, T, S) array
-        The values of `scaled`.
+        The likelihoods p(o_t | D_t, u_t), scaled by `scaled`.
     control : (B, T) array
         The control in force in each step.
 

@@ -40,11 +40,11 @@ def _apply_block(
     source: Float,
     target: Float,
 ) -> None:
-    """Fill `target` (S, L) with the numbers `source` (S, L) after one block of a transition.
+    """Apply one block of a transition to `source` (S, L); the result is written to `target` (S, L).
 
-    `entries` (non-zeros, ...) are the probabilities of the lists, in the lanes from the first to
-    the end of `lanes`. The block is applied along the first axis of the joint state, which becomes
-    the last one, as in `apply_blocks`.
+    The block is the transition of one state factor: it is applied along the first axis of the joint
+    state, which becomes the last one, as in `apply_blocks`. Each of L lanes has transitions with
+    other probabilities: the columns `lanes[0]` to `lanes[1]` of `entries` (non-zeros, ...).
     """
     levels, first_row, start, predecessor, _, _ = lists
     level_count = levels[block]
@@ -80,7 +80,10 @@ def _apply_block_backward(
     source: Float,
     target: Float,
 ) -> None:
-    """Fill `target` (S, L) with `source` (S, L) multiplied by the transpose of a block."""
+    """Apply the transpose of one block to `source` (S, L), for the backward pass.
+
+    The result is written to `target` (S, L). The arguments are those of `_apply_block`.
+    """
     levels, first_row, start, predecessor, _, _ = lists
     level_count = levels[block]
     inner_count = np.uint64(len(source) // level_count)
@@ -153,9 +156,10 @@ def _spread_lanes(
 def _cheapest_meeting(grids: SubGrids, control: Index, backward_lanes: Index) -> int:
     """Return the step at which a forward and a backward pass meet with the least work.
 
-    Each pass has a lane for each point of the axes on which its own transitions depend. If the
-    twins of a fleet change once from one control to another, two passes have one axis each, where a
-    forward pass alone would have two axes after the change. `backward_lanes` (T,) is work space.
+    Each pass has a lane for each point of the grid whose axes are the probabilities that its own
+    transitions depend on. If a twin changes once from one control to another, each of two passes
+    has one axis, whereas a forward pass alone would have two axes after the change.
+    `backward_lanes` (T,) is work space.
     """
     steps = len(control)
     axes = 0
@@ -186,8 +190,9 @@ def _backward_to(
     current: Float,
     other: Float,
 ) -> tuple[int, Float, Float]:
-    """Return the backward sums of a twin after a step: their set of axes, their array, the other.
+    """Compute the backward sums of a twin, from its last step down to that after `meeting`.
 
+    Returns the set of axes on which the sums depend, the array of the sums, and the other array.
     The arguments are those of `evidence_on_grid` for one twin; `current` and `other` (S, L) are
     work space.
     """
@@ -227,7 +232,7 @@ def _forward_to(
     current: Float,
     other: Float,
 ) -> tuple[int, Float, Float]:
-    """Return the forward sums of a twin up to a step; arguments as for `_backward_to`."""
+    """Compute the forward sums of a twin up to the step `meeting`; see `_backward_to`."""
     state_count = likelihood.shape[1]
     axes = 0
     lanes = grids.first[1]
@@ -319,10 +324,10 @@ class _LikelihoodWork(NamedTuple):
 def _multiply_by_likelihood(
     log_density: Float, belief: Float, belief_sum: Float, log_evidence: Float, work: _LikelihoodWork
 ) -> None:
-    """Multiply beliefs (S, L) in place by the likelihood of a step over its largest value.
+    """Multiply beliefs (S, L) in place by the likelihood of a step, scaled to a largest value of 1.
 
-    `log_density` is (S, L), or (S, 1) if it is the same in all lanes. `belief_sum` (L,) is filled
-    with the sums of the beliefs afterwards, and the log of the largest likelihood is added to
+    `log_density` is (S, L), or (S, 1) if it is the same in all lanes. The sums of the multiplied
+    beliefs are written to `belief_sum` (L,), and the log of the largest likelihood is added to
     `log_evidence` (L,).
     """
     largest, mantissa, power_bits = work

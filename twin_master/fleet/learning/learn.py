@@ -77,9 +77,9 @@ def learn_from_fleet(
 ) -> JsonObject:
     """Learn from all twins of a fleet, and write the results to a file.
 
-    This gives the probabilities with which damage grows, the noise of the sensors, and the
-    distribution of the calibrated parameter over the assets. The record is also written to the
-    fleet's folder.
+    Learnt are the probabilities with which damage grows, the noise of the sensors, and the
+    distribution of the calibrated parameter over the assets. The record of the results is also
+    written to the fleet's folder.
 
     Parameters
     ----------
@@ -199,10 +199,10 @@ class _GroupLessons:
     def with_probabilities(
         self, posteriors: Sequence[Distribution], flown_controls: set[str]
     ) -> JsonObject:
-        """Return the record of the group, completed by its probabilities of worsening.
+        """Return the record of the group, completed by the probabilities with which damage grows.
 
-        `posteriors` has one for each probability; `flown_controls` are the controls for which
-        observations contribute.
+        `posteriors` has a distribution for each probability; `flown_controls` are the controls
+        about which the observations say something.
         """
         probabilities = {}
         for name, assumed, posterior in zip(
@@ -220,7 +220,7 @@ class _GroupLessons:
 def _lessons_of_groups(
     folder: Path, config: JsonObject, pool: TaskPool, progress: Progress
 ) -> dict[str, _GroupLessons]:
-    """Learn from each group separately; skip groups without a flown twin."""
+    """Learn from each group of a fleet by itself; groups without a flown twin are left out."""
     lessons = {}
     for record in config["fleet"]["groups"]:
         group = open_group(folder, record["name"], names=False)
@@ -241,8 +241,8 @@ def _lessons_of_groups(
 def _records(lessons: dict[str, _GroupLessons]) -> JsonObject:
     """Return the records of all groups, and of the distribution that their probabilities share.
 
-    They share one if several groups have learnt probabilities, with the same names in all groups,
-    and at most `_MOST_SHARED` of them.
+    Groups share a distribution if several of them have learnt probabilities, if these have the same
+    names in all groups, and if they are at most `_MOST_SHARED`.
     """
     grids = [lesson.grid for lesson in lessons.values() if lesson.grid is not None]
     distinct_names = {lesson.family.names for lesson in lessons.values()}
@@ -302,9 +302,10 @@ class _FlownGroup:
     reading: str
 
     def learn(self, pool: TaskPool, progress: Progress) -> _GroupLessons:
-        """Learn the noise, the probabilities of worsening, and the population from the twins.
+        """Learn from the twins of the group: noise, growth of damage, and population.
 
-        The noise is learnt first, because the likelihoods for the other two need it.
+        The noise is learnt first, because the likelihoods for the other two need it. The population
+        is the distribution of the calibrated parameter over the assets.
         """
         scenario = self.twins_by_scenario[0].knowledge.scenario
         family = _transition_family(scenario)
@@ -317,7 +318,7 @@ class _FlownGroup:
             noise = noise_factor(store, self.twins_by_scenario, family, nodes)
         population_evidence = self._evidence(family, noise.mean, nodes, pool, progress)
         growth_evidence = population_evidence
-        if nodes is not None:  # growth changes so little with the parameter that half of them do
+        if nodes is not None:  # growth depends so weakly on the parameter that half the nodes do
             growth_evidence = self._evidence(family, noise.mean, nodes.every_second, pool, progress)
         growth, population = self._growth_and_population(
             growth_evidence, population_evidence, family, nodes
@@ -357,10 +358,10 @@ class _FlownGroup:
         pool: TaskPool,
         progress: Progress,
     ) -> GroupEvidence:
-        """Return the evidence of the twins, computed by the processes of a pool.
+        """Return the evidence of the twins, which the processes of a pool compute when it is asked.
 
-        `noise_factor` multiplies the assumed noise. The calibrated parameter takes the values of
-        the nodes, or without nodes the draws of each twin's calibration.
+        `noise_factor` multiplies the assumed noise. The calibrated parameter takes the values at
+        the nodes; without nodes, it takes the draws of each twin's calibration.
         """
         readings_at_nodes = None if nodes is None else nodes.predicted
         flights = []
@@ -386,10 +387,11 @@ class _FlownGroup:
         family: TransitionFamily,
         nodes: ParameterNodes | None,
     ) -> tuple["_Growth", PopulationPosterior | None]:
-        """Learn the probabilities of worsening, and with nodes the population of the parameter.
+        """Learn with which probabilities damage grows, and how the parameter varies over assets.
 
-        Each is learnt given the other, in rounds: first from some of the twins, finally from all. A
-        round begins with the grid and the population of the last one.
+        Each of the two is learnt given the other, in rounds: first from some of the twins, finally
+        from all. A round begins with the grid and the population of the last one. Without `nodes`
+        of the parameter, there is no population.
         """
         first_axes = None
         population = None
@@ -436,20 +438,21 @@ def _transition_family(scenario: Scenario) -> TransitionFamily:
 
 
 def _counts(group: "xr.DataTree", control_names: Sequence[str]) -> tuple[int, set[str]]:
-    """Return the number of flown twins with an alarm, and the controls with a further step.
+    """Count the flown twins with an alarm, and list the controls of which a growth can be learnt.
 
-    These are the controls under which a twin has flown a step before its last one.
+    These are the controls under which a twin has flown a step before its last one, because growth
+    under a control shows in the step after it.
     """
-    alarmed = 0
+    alarmed_count = 0
     followed_controls: set[str] = set()
     for rows in row_blocks(group):
         flown = flown_rows(stored_values(group, "status", rows))
-        alarmed += int(np.sum(notice_counts(group, "alarm", rows)[flown] > 0))
+        alarmed_count += int(np.sum(notice_counts(group, "alarm", rows)[flown] > 0))
         control = stored_values(group, "observed/control_index", rows)[flown]
         is_followed = control[:, 1:] >= 0
-        followed = np.unique(control[:, :-1][is_followed]).tolist()
-        followed_controls |= {control_names[index] for index in followed}
-    return alarmed, followed_controls
+        control_indices = np.unique(control[:, :-1][is_followed]).tolist()
+        followed_controls |= {control_names[index] for index in control_indices}
+    return alarmed_count, followed_controls
 
 
 def _rounds(twin_count: int, *, has_population: bool) -> list[int]:
@@ -492,11 +495,11 @@ def _growth(
     prior: Float | None,
     first_axes: Axes | None,
 ) -> _Growth:
-    """Return, on a grid, the likelihood of the probabilities of worsening.
+    """Return, on a grid, the likelihood of the probabilities with which damage grows.
 
-    `prior` (E,) is that of the calibrated parameter at its nodes, or None. The search for the grid
-    begins with `first_axes`. All twins are read again for each grid, because the likelihoods of the
-    states of many twins do not fit in memory.
+    `prior` (E,) holds the probabilities of the calibrated parameter at its nodes; None if it has no
+    nodes. The search for the grid begins with `first_axes`. All twins are read again for each grid,
+    because the likelihoods of the states of many twins do not fit in memory.
     """
     if not family.names:
         return _Growth(None, evidence.grid_sum((), prior).twin_count)

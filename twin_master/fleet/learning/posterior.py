@@ -222,9 +222,10 @@ class _GroupOnAxes:
 def _group_on_axes(
     grid: LikelihoodGrid, mean_axis: Float, concentration_axis: Float
 ) -> _GroupOnAxes:
-    """Return a group's likelihood on fine axes, with its priors for all hyperparameters.
+    """Return a group's likelihood on fine axes, and its prior for each pair of hyperparameters.
 
-    The M means are log odds, the C concentrations decimal logarithms; there are H = M C pairs.
+    `mean_axis` (M,) holds log odds, `concentration_axis` (C,) decimal logarithms; they have
+    H = M C pairs.
     """
     axes = tuple(np.linspace(axis[0], axis[-1], SHARED_POINTS) for axis in grid.axes)
     mean, concentration = np.meshgrid(logistic(mean_axis), 10.0**concentration_axis, indexing="ij")
@@ -278,12 +279,11 @@ class PopulationPosterior:
     deviation: Distribution
 
     def prior_of_member(self, nodes: Float) -> Float:
-        """Return the probabilities (E,) of E equally spaced values of a member's parameter.
+        """Return the prior probabilities (E,) of E equally spaced values of a member's parameter.
 
-        The prior is a normal distribution with the variance of the posterior predictive: the
-        expected variance of the population, plus the variance of its mean. If it is narrower than
-        the distance between two values, nearly all of it would fall on one value, which is not the
-        mean. Therefore it has a least width.
+        The prior is normal, with the variance of the posterior predictive: the expected variance of
+        the population plus the variance of its mean. It has a least width, because nearly all of a
+        prior that is narrower than the distance of two values would fall on a single value.
         """
         predictive_variance = (
             self.deviation.mean**2
