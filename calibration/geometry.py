@@ -189,12 +189,14 @@ def tailored_geometry(lengths: Lengths) -> Geometry:
 def tailored_design(design: WingDesign, lengths: Lengths) -> WingDesign:
     """Return a wing's design with the measured planform.
 
-    Only the semi-span and the chords change. Some positions are fractions in the design, and so
-    move with the planform: those of ribs, point masses and bands of the skin along the span, and
-    all positions along the chord. Other positions are distances in the design, and so do not
-    change: those of gauges and defect regions from the root, and that of the test load from the
-    tip. The net load in a turning flight, the thicknesses of skin and webs, and the size of the
-    largest cell of the mesh do not change either.
+    Only the semi-span and the chords of the design change:
+
+    - Positions that the design states as fractions move with the planform: those of ribs, point
+      masses and bands of the skin along the span, and all positions along the chord.
+    - Positions that it states as distances stay: those of gauges and defect regions from the root,
+      and that of the test load from the tip.
+    - The net load in a turn, the thicknesses of skin and webs, and the size of the largest cell of
+      the mesh stay as well.
 
     Raises
     ------

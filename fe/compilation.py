@@ -62,14 +62,14 @@ def compiled(
     *,
     reorders_sums: bool = False,
 ) -> Callable[Parameters, Result]:
-    """Return a function that numba compiles at the first call, and that releases the GIL.
+    """Let numba compile a function at its first call; the compiled function releases the GIL.
 
-    The first time in a process that something is compiled, or runs as plain Python, a note is
-    printed.
+    The first time in a process that something is compiled, or runs as plain Python because numba is
+    missing, a note is printed.
 
-    The machine code is kept in the folder `NUMBA_CACHE_DIR`, else beside the function's file, else
-    in the cache folder, under a hash of the sources. If none is writable, the function is compiled
-    anew in every process.
+    The machine code is kept, under a hash of the sources, in the folder `NUMBA_CACHE_DIR`, or else
+    beside the function's file, or else in the cache folder. If none of these is writable, the
+    function is compiled anew in every process.
 
     Parameters
     ----------
@@ -243,7 +243,10 @@ def _functions_of(module: ModuleType) -> list[NumericalFunction]:
 
 @functools.cache
 def law_functions() -> tuple[NumericalFunction, ...]:
-    """Return the functions of `fe.runtime.laws`, and let compiled functions call them."""
+    """Register the functions of `fe.runtime.laws` with numba, so that compiled functions call them.
+
+    Returns these functions.
+    """
     from fe.runtime import laws  # most compiled functions know no laws
 
     implementations = {

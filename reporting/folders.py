@@ -158,14 +158,14 @@ def restore_folder(folder: Path) -> bool:
 
 
 def _restore_from(parking: Path, folder: Path) -> bool:
-    """Move the content that `replace_folder` had parked back, if `folder` is missing.
+    """Deal with old content that `replace_folder` has moved away; return whether it was put back.
 
-    Returns whether the content was moved back. The parked content is
+    The old content is
 
-    - left alone while another process has it locked;
-    - moved back if there is no folder;
-    - removed if the folder there is the one that replaced it;
-    - kept if the folder there is any other, which somebody else has made.
+    - left alone as long as another process has it locked;
+    - put back if `folder` does not exist;
+    - removed if `folder` is the one that replaced it;
+    - kept if `folder` is any other, which somebody else has made.
     """
     old_content = parking / folder.name
     if not old_content.is_dir():

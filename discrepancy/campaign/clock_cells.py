@@ -70,15 +70,15 @@ def is_time(cell: str) -> bool:
 def _clock_time(cell: str) -> _ClockTime | None:
     """Return the clock time in a cell; None if it has none, or one that does not exist.
 
-    Of two numbers, such as `10:15`, those after a date are hours and minutes, and those with a
-    fraction are minutes and seconds. Two numbers with neither, or with both, are not read.
+    Two numbers, such as `10:15`, are hours and minutes after a date, and minutes and seconds with a
+    fraction. With neither or with both, they are not read.
     """
     if _is_date(cell):
         return _ClockTime(cell, Decimal(0), _DAY)
     match = _CLOCK.fullmatch(_COMPACT.sub(r"\1-\2-\3T\4:\5:\6\7", cell))
     if match is None:
         return None
-    day, hours, minutes, seconds, fraction, half, offset = match.groups(default="")
+    day, hours, minutes, seconds, fraction, am_or_pm, offset = match.groups(default="")
     period = _DAY
     if not hours and bool(day) == bool(fraction):
         return None
@@ -87,10 +87,10 @@ def _clock_time(cell: str) -> _ClockTime | None:
     elif not hours:  # minutes and seconds, which start again at each full hour
         period = _HOUR
     hour_count = int(hours or 0)
-    if half:  # the A or P of AM or PM
+    if am_or_pm:  # the A or P of AM or PM
         if not 1 <= hour_count <= 12:
             return None
-        hour_count = hour_count % 12 + (12 if half in "Pp" else 0)
+        hour_count = hour_count % 12 + (12 if am_or_pm in "Pp" else 0)
     whole_seconds = _HOUR * hour_count + 60 * int(minutes) + int(seconds)
     time_of_day = whole_seconds + Decimal(f"0{fraction.replace(',', '.')}")
     is_past_midnight = bool(day) and time_of_day > _DAY  # 24:00:00 is allowed
@@ -115,9 +115,9 @@ def _offset_seconds(offset: str) -> int:
 def _day_numbers(date: str) -> dict[str, int]:
     """Return the days since the year 1 that a date can mean, by `DAY_FIRST` and `MONTH_FIRST`.
 
-    Both orders have the same day if the date can be read in one way only, such as `2026-03-31`, or
-    any date with points, in which the day comes first. An order in which there is no such day is
-    missing; for a text that is no date, both are.
+    Both orders give the same day if the date can be read in one way only: `2026-03-31`, for
+    example, or any date with points, in which the day comes first. An order in which the day does
+    not exist is missing; for a text that is not a date, both are.
     """
     text = re.sub(r"(?<=\d)(?=[A-Za-z])|(?<=[A-Za-z])(?=\d)|[-/ ,.]+", " ", date)
     for layout in _CLEAR_LAYOUTS:
@@ -140,7 +140,8 @@ def _is_date(cell: str) -> bool:
 def possible_date_orders(columns: Iterable[Sequence[str]]) -> list[str]:
     """Return the orders, `DAY_FIRST` or `MONTH_FIRST`, in which all dates of a table can be read.
 
-    The result is `DAY_FIRST` alone if every date is clear, or if none of the orders fits all dates.
+    The result is `DAY_FIRST` alone if each date can be read in one way only, or if no order fits
+    all dates.
     """
     days = set()  # the dates as texts
     for cells in columns:
@@ -153,8 +154,10 @@ def possible_date_orders(columns: Iterable[Sequence[str]]) -> list[str]:
         for order in _NUMBER_LAYOUTS
         if all(order in numbers for numbers in numbers_of_days if numbers)
     ]
+    if not orders:
+        return [DAY_FIRST]
     is_clear = all(len({*numbers.values()}) == 1 for numbers in numbers_of_days if len(numbers) > 1)
-    return orders[:1] if is_clear and DAY_FIRST in orders else orders or [DAY_FIRST]
+    return orders[:1] if is_clear and DAY_FIRST in orders else orders
 
 
 def is_unclear_date(cell: str) -> bool:

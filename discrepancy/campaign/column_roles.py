@@ -70,9 +70,9 @@ class ColumnReader:
         self._outputs = outputs
 
     def read_column(self, sheet: Sheet, head: str, unit: str) -> LaboratoryColumn:
-        """Return the record of a table's column; ask the user for what is not clear.
+        """Return the record of a table's column; what is not clear becomes a question to the user.
 
-        While the unit or the quantity is not known, the factor `to_si` of the record is None.
+        As long as the unit or the quantity is not known, the factor `to_si` of the record is None.
 
         Parameters
         ----------
@@ -112,8 +112,8 @@ class ColumnReader:
     def _column_of_readings(self, sheet: Sheet, head: str, unit: str) -> LaboratoryColumn:
         """Return the record of a column, as if its cells were readings without a scale.
 
-        The user is asked for a role or unit that is not known. The record then has no SI unit; nor
-        has it for a column that is left out.
+        If its role or unit is not known, the user is asked for it. Then, and also if the column is
+        left out, the record has no SI unit.
         """
         role = self._determine_role(sheet, head, unit)
         self._check_role(sheet, head, role)
@@ -185,9 +185,14 @@ class ColumnReader:
     def _determine_role(self, sheet: Sheet, head: str, unit: str) -> str:
         """Return the role of a column: time, an input, or the model output that it measures.
 
-        These decide in turn: the user's answer; the head, if it is the name of an input; the unit,
-        if this is the only column with a unit of time (or of force); the head, if it is the name of
-        a model output. Otherwise the user is asked, and the result is empty.
+        The first of these that is known decides:
+
+        - the answer of the user;
+        - the head, if it is the name of an input;
+        - the unit, if this is the only column with a unit of time (or of force);
+        - the head, if it is the name of an output of the model.
+
+        Otherwise the user is asked, and the result is empty.
         """
         answer = self._questionnaire.stated_answer("column", head)
         if answer is not None:
@@ -218,10 +223,10 @@ class ColumnReader:
     def _determine_quantity(self, head: str, role: str, unit: str) -> Quantity | None:
         """Return the quantity that a channel or an input measures.
 
-        The candidates are the quantities with this unit, or the answer of the user. The quantity of
-        the model's output is taken if it is a candidate. Otherwise a length is a displacement, and
-        a unit of strain is a strain. If several candidates are left, the user is asked, and the
-        result is None.
+        The candidates are the quantities with this unit, or the answer of the user. If the quantity
+        of the model's output is one of them, it is taken. Otherwise a length is a displacement, and
+        what has a unit of strain is a strain. If several candidates remain, the user is asked, and
+        the result is None.
         """
         answer = self._questionnaire.stated_answer("quantity", head)
         quantities = possible_quantities(unit, answer)

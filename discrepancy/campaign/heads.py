@@ -96,10 +96,10 @@ def load_or_time_role(unit: str) -> str:
 
 
 def time_heads(heads: Sequence[str], units: Sequence[str]) -> tuple[str, ...]:
-    """Return the heads of the columns of times of a table.
+    """Find the columns of times of a table; return their heads.
 
     There may be one, or several with a common word in their names, such as `time1` and `time2`. If
-    several have no word in common the result is empty, because one of them may be a delay, or
+    several have no word in common, the result is empty, because one of them may be a delay or
     another clock of the same rows.
 
     Parameters

@@ -39,7 +39,7 @@ class _LoadPanel(NamedTuple):
 
 
 def _load_panels(residuals: ResidualSet) -> list[_LoadPanel]:
-    """Return a panel for each measured quantity of the static trials, and then of the flights."""
+    """Return the panels: one for each measured quantity of static trials, then of flights."""
     load_panels = []
     for kind, label in ((TrialKind.STATIC, "force, N"), (TrialKind.FLIGHT, "load factor")):
         measured: set[str] = set()

@@ -155,7 +155,7 @@ def _size_name(parameter: str, primitive: Primitive, unit: str) -> str:
 def _location_text(
     primitive: Primitive, size: PrimitiveInterval, model: Model, campaign: Campaign
 ) -> str:
-    """Return the reference speed or displacement of a force, or the station of a mass.
+    """Return where a size holds: a force's reference speed or displacement, or a mass's station.
 
     It is a phrase such as " at 0.3 m/s"; empty for other sizes.
     """
@@ -204,7 +204,7 @@ def _vector_text(vector: FloatArray, digits: int) -> str:
 
 
 def definite_unit(unit: str, primitive: Primitive, model: Model, campaign: Campaign) -> str:
-    """Return the unit of a primitive's parameter, as its port and its channel determine it.
+    """Return the unit of a primitive's parameter, which its port or its channel may determine.
 
     Parameters
     ----------
@@ -220,11 +220,11 @@ def definite_unit(unit: str, primitive: Primitive, model: Model, campaign: Campa
     str
         The unit:
 
-        - the unit of the channel for "channel's unit"; empty for one that is relative to it
-        - a unit without "or" as it is, and empty for a plain number
-        - of "N/m or N m/rad", the first for what moves and the second for what turns, a port or a
-          support; both for a port that may do either
-        - the units of the port's own force and state, if these are neither
+        - for "channel's unit", that of the channel; empty for a unit relative to it
+        - for a unit without "or", this unit; empty for a plain number
+        - for a unit such as "N/m or N m/rad", the first if the port or support moves, the second if
+          it turns, and both if it may do either
+        - otherwise the unit of the port's own force or state
     """
     if unit.startswith(CHANNEL_UNIT):
         return _channel_unit(primitive, campaign) if unit == CHANNEL_UNIT else ""

@@ -97,9 +97,9 @@ def port_motion_units(force: ForceAtPort) -> tuple[str, str, str]:
 
 
 def force_sentence(force: ForceAtPort) -> str:
-    """Return the sentences on a missing force: its port, its size, and what its law leaves.
+    """Return the sentences on a missing force: where it acts, how large it is, and its law.
 
-    The first one also compares the evidence for the port with that for the second best port.
+    The first sentence also compares the evidence for the port with that for the second best port.
     """
     name, displacement_unit, speed_unit = port_motion_units(force)
     evidence = force.evidence[force.port]

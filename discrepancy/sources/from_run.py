@@ -203,7 +203,7 @@ def _strain_channels(gauge_numbers: Sequence[int], noise: float) -> dict[str, re
 
 
 def _flight_remarks(is_used: BoolArray, noise: float, source_of_noise: str) -> tuple[str, ...]:
-    """Return the remarks on a flight: its length, its noise, and its lost readings.
+    """Return the remarks on a flight: on its length, its noise, and its lost readings.
 
     `is_used` (N, C) is False for readings of N steps that were lost, `noise` the standard deviation
     of a gauge's noise [1], and `source_of_noise` the phrase on where it is stated.

@@ -174,7 +174,7 @@ def _read_lab_data(data: Path) -> _LabData:
 def _loading_runs(measurements: LoadDisplacementData) -> RigFiles:
     """Return the loading runs of the wing as static trials, and the channel of the tip.
 
-    An error of the load counts as noise of the displacement that it causes by the compliance.
+    An error of the load counts as noise: that of the displacement which it causes.
     """
     compliance = float(np.median(measurements.displacement / measurements.load))
     deviation_by_load = measurements.load_standard_deviation * compliance
@@ -196,12 +196,12 @@ def _loading_runs(measurements: LoadDisplacementData) -> RigFiles:
 def trial_scatter(windows: Sequence[PlotWindow]) -> FloatArray:
     """Return the noise of the signal from the differences between R trials of N samples.
 
-    All trials are releases of one kind, so that they share the motion, whatever its law is.
-    Differences other than in amplitude, delay and zero are noise. Each trial is therefore fitted by
-    the mean of all trials (amplitude), its first and second time derivatives (delay, by Taylor's
+    All trials are releases of one kind, and so have the same motion, whatever its law is. They may
+    differ in amplitude, delay and zero; other differences are noise. Each trial is therefore fitted
+    by the mean of all trials (amplitude), its first and second time derivatives (delay, by Taylor's
     series) and a constant (zero). The R - 1 orthonormal Helmert contrasts of the residuals are
-    independent and have the variance of a single trial. The fit takes four degrees of freedom from
-    each contrast, for which the variance is corrected.
+    independent, each with the variance of a single trial. This variance is corrected for the four
+    degrees of freedom that the fit takes from each contrast.
 
     Parameters
     ----------
@@ -245,10 +245,10 @@ def _plot_window(
 ) -> PlotWindow:
     """Return the samples of a ring-down from `begin` [s] on, without the drift of its zero.
 
-    The record was digitised from a published plot, with one value for each column of pixels. Each
-    sample is the mean of `columns_per_sample` such values. Left out are columns where the zero is
-    not known, and columns at the end that do not fill a sample. The sampling interval of the result
-    is constant, and its time starts at zero.
+    The record was read off a published plot, with one value for each column of pixels. Each sample
+    is the mean of `columns_per_sample` such values. Columns where the zero is not known are left
+    out, and so are columns at the end that do not fill a sample. The samples are evenly spaced, and
+    their time starts at zero.
 
     Parameters
     ----------

@@ -35,8 +35,8 @@ def state_at_first_stamp(
 ) -> InitialMotion:
     """Return the state at the first time of a record that is not a ring-down.
 
-    By `excitation.begins` it is the equilibrium under the first loads, rest without loads, or the
-    unknown state `excitation.initial`.
+    `excitation.begins` decides whether it is the equilibrium under the first loads, rest without
+    loads, or the unknown state `excitation.initial`.
 
     Raises
     ------
@@ -73,11 +73,11 @@ def state_at_first_stamp(
 
 
 def _drive_speeds(system: LinearSystem, excitation: Excitation) -> FloatArray:
-    """Return the speeds (P,) of the P prescribed motions at the first stamp of a record.
+    """Return the speeds (P,) of the P prescribed motions at the first time of a record.
 
-    The slope of a spline through recorded displacements is set to zero if it is nearly so, because
-    dry friction acts at any other speed. A recorded speed, a prescribed state, and the drives of a
-    record that begins in an unknown state, keep their values.
+    If displacements were recorded, the speed is the slope of a spline, which is set to zero if it
+    is nearly zero, because dry friction acts at any other speed. Recorded speeds, prescribed
+    states, and the drives of a record that begins in an unknown state keep their values.
     """
     motions = excitation.prescribed_motions.values()
     first_stamp = excitation.time[:1]
@@ -103,9 +103,9 @@ def _settled_amplitudes(
 ) -> tuple[FloatArray, FloatArray | None]:
     """Return the amplitudes (M,) of the modes in equilibrium at the first stamp of a record.
 
-    The first loads act, and the drives have their first positions and speeds (P,). The amplitude of
-    a mode of displacements is its coordinate, that of a mode of states its speed. The second result
-    is the memory of the laws; None if nothing acts, and all amplitudes are then zero.
+    The first loads act, and the P drives have their first positions and speeds. The amplitude of a
+    mode of displacements is its coordinate, that of a mode of states its speed. The second result
+    is the memory of the laws. If nothing acts, all amplitudes are zero, and the memory is None.
     """
     first_stamp = excitation.time[:1]
     load = excitation.loads_at(first_stamp, np.eye(system.unknown_count))  # (1, N)
@@ -163,10 +163,10 @@ def released_state(
         return _held_state(system, point, laws, relative_displacements, unit_amplitudes, first_load)
     angular_frequency = system.angular_frequency
     # the loads shift the position of rest: a load f has the modal amplitudes shapes.T f / omega^2
-    under_load: FloatArray | float = 0.0
+    displacement_by_loads: FloatArray | float = 0.0
     if first_load.any():
-        under_load = (first_load @ system.shapes)[0] / angular_frequency**2
-    q = relative_displacements * unit_amplitudes + under_load
+        displacement_by_loads = (first_load @ system.shapes)[0] / angular_frequency**2
+    q = relative_displacements * unit_amplitudes + displacement_by_loads
     v = relative_velocities * unit_amplitudes * angular_frequency
     return ReleasedState(InitialMotion(q, v), None)
 

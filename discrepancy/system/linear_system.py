@@ -175,7 +175,7 @@ class LinearSystem:
 
     @cached_property
     def modes(self) -> Modes:
-        """Modes of the motions that no drive prescribes."""
+        """The modes of all motions and states that no drive prescribes."""
         if self.solved is not None:
             angular_frequency = 2.0 * np.pi * self.solved.modes.frequency
             shapes = np.ascontiguousarray(self.solved.mode_shapes)
@@ -197,8 +197,8 @@ class LinearSystem:
     def _state_shapes(self) -> FloatArray:
         """Return the shapes (state_count, K) of the K independent states that no drive prescribes.
 
-        The shapes are along the principal axes of the capacity matrix T, which is the lower right
-        block of `mass`, and each has a modal capacity of 1.
+        They are the principal axes of the capacity matrix (the lower right block of `mass`), scaled
+        to a modal capacity of 1.
         """
         n = self.displacement_count
         if not self.state_count:
@@ -292,7 +292,7 @@ class LinearSystem:
     def modal_system(self) -> ModalSystem:
         """The equations of motion in modal coordinates, with drives and ports.
 
-        Without drives, coupling of the modes that is only a rounding error is left out.
+        Without drives, a coupling of the modes that is only a rounding error is set to zero.
         """
         mode_count = len(self.angular_frequency)
         drive_count = len(self.drives)

@@ -62,10 +62,10 @@ class DisplacementReadings(NamedTuple):
 def displacement_readings(
     trial: Trial, equations: Sequence[OutputEquation]
 ) -> DisplacementReadings:
-    """Return the readings of the channels of a trial that show displacements alone.
+    """Return the readings of those channels of a trial that show displacements only.
 
-    `equations` are those of the output of each channel. The constant of an output is subtracted. A
-    channel that also shows a rate, a state or a load directly is left out.
+    `equations` are those of the output of each channel, whose constant is subtracted. A channel
+    that also shows a rate, a state or a load directly is left out.
     """
     columns = []
     for column, equation in enumerate(equations):

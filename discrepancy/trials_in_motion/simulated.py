@@ -84,10 +84,10 @@ class SystemArrays(NamedTuple):
 def force_at_port(
     laws: LawArrays, port: int, stamp: int, position: float, speed: float, half_width: float
 ) -> tuple[float, float, float]:
-    """Return the force of all laws at a port, and its tangents by position and speed.
+    """Return the force of all laws at a port, and its derivatives by position and speed.
 
-    Laws of the speed are averaged over a window, see `mean_force`; their tangents by the position,
-    which are small, are left out.
+    Laws of the speed are averaged over a window of speeds, see `mean_force`. Their derivatives by
+    the position, which are small, are left out.
     """
     force = 0.0
     by_position = 0.0

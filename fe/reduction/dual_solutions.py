@@ -111,9 +111,10 @@ def _dual_directions(solutions: list[FloatArray]) -> FloatArray:
 def _project_duals(
     terms: ReductionTerms, outputs: FloatArray, directions: FloatArray
 ) -> list[tuple[FloatArray, FloatArray]]:
-    """Return the residual factor and the projected stiffness (T, M, M) for each output.
+    """Return the factor of the dual residual and the projected stiffness for each output.
 
-    `outputs` (n, O) and the `directions` (O, n, M) of each output are whitened.
+    The factor is that of `_residual_factor`; the projected stiffness is (T, M, M). `outputs`
+    (n, O), and the `directions` (O, n, M) of each output, are whitened.
     """
     factors = terms.factors
     size, count = outputs.shape

@@ -127,8 +127,11 @@ def _refine(terms: ReductionTerms, working: ProjectedBasis, mode_count: int, sta
 def _refine_states(
     terms: ReductionTerms, working: ProjectedBasis, states: list[ModalState], mode_count: int
 ) -> Iterator[ModalState]:
-    """Add Davidson corrections X^-1 (K - omega^2 M) phi; yield each state whose modes converged."""
-    largest = np.inf
+    """Extend a basis by Davidson's method until it holds the modes of all states.
+
+    Yields each state as soon as its modes have converged. See `_davidson_corrections`.
+    """
+    largest_residual = np.inf
     for _ in range(MOST_CORRECTIONS):
         corrections, relative_norms = _davidson_corrections(terms, working, states, mode_count)
         is_large = relative_norms > RESIDUAL_TOLERANCE
@@ -137,11 +140,11 @@ def _refine_states(
         yield from (state for state, corrected in by_state if not corrected)
         if not needs_correction.any():
             return
-        largest = float(relative_norms.max())
+        largest_residual = float(relative_norms.max())
         working.add(corrections[:, is_large])
         states = [state for state, corrected in by_state if corrected]
     raise ReductionError(
-        f"The modes of a sampled state reached a residual of {largest:.2g} only in "
+        f"The modes of a sampled state reached a residual of {largest_residual:.2g} only in "
         f"{MOST_CORRECTIONS} corrections, but {RESIDUAL_TOLERANCE:g} is needed."
     )
 
@@ -215,7 +218,7 @@ def _compressed_directions(
 def _projected_on(
     terms: ReductionTerms, working: ProjectedBasis, directions: FloatArray, count: int
 ) -> ModalReduction:
-    """Return the modal reduction on directions (k, Nm) of the working basis."""
+    """Project a structure on directions (k, Nm) of the working basis: the modal reduction."""
     structure = terms.structure
     stiffness = project_terms(working.stiffness, directions)
     mass = project_terms(working.mass, directions)

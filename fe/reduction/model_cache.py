@@ -315,7 +315,7 @@ def _structure_cache_file(file: Path, *, with_ports: bool = False) -> Path:
 
 
 def field_basis(operators: "AffineOperators", reduction: "Reduction") -> WingFields:
-    """Return a reduced model with its bases expanded on the mesh of the full model."""
+    """Return a reduced model of a wing with its basis vectors as fields on the full mesh."""
     from fe.elements.cells import CellMesh
     from fe.elements.kinds import HEXAHEDRA_20
 

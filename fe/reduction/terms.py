@@ -145,8 +145,8 @@ class ReductionTerms:
     def _set_stiffness_terms(self) -> None:
         """Set the stiffness terms, with the parameter and region of each.
 
-        The last term has to be constant, as the error bound needs one: if it is not, a constant
-        term of zeros is added.
+        The error bound needs a constant term, which must be the last one. If there is none, a
+        constant term of zeros is added.
         """
         parameters = tuple(self.structure.parameters)
         regions = self.structure.regions
@@ -236,9 +236,9 @@ class ReductionTerms:
         The error bound of an output needs the output's dual solution. In any state it is
         approximated by a combination of the dual solutions in the states of one anchor.
 
-        With few regions, the range of each loss is halved. Each of the 2^K combinations of halves
-        has an anchor of one state, in the middle of these halves. With many regions there is a
-        single anchor, whose states are the corners of the box of all parameters and losses.
+        With few regions, the range of each of K losses is halved, and each of the 2^K combinations
+        of halves has an anchor of one state, in their middle. With many regions there is a single
+        anchor, whose states are the corners of the box of all parameters and losses.
 
         Returns
         -------
@@ -324,11 +324,12 @@ class ReductionTerms:
         return modal_states
 
     def least_outputs(self, loads: FloatArray, outputs: FloatArray) -> FloatArray:
-        """Return the least outputs to which errors are relative, see `LEAST_COSINE`.
+        """Return the least output of each group and load by which an error is divided.
 
-        In whitened coordinates, an output l responds to a load f by l . f, which is at most |l| |f|
-        (Cauchy and Schwarz). A load to which no output of a group responds is compared with the
-        responses to all loads, see `UNSEEN_FRACTION`.
+        A relative error would have no meaning for an output that hardly responds. In whitened
+        coordinates, an output l responds to a load f by l . f, which is at most |l| |f| (Cauchy and
+        Schwarz); the least output is `LEAST_COSINE` of this. If no output of a group responds to a
+        load more than that, it is at least `UNSEEN_FRACTION` of the largest response to any load.
 
         Parameters
         ----------

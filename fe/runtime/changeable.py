@@ -452,10 +452,9 @@ class ChangeableModel(ReducedModel):
         (S, k) array
             The force or moment along each motion.
         """
-        stiffness = springs[:, np.newaxis]
-        is_held = stiffness == 0.0
+        is_held = springs[:, np.newaxis] == 0.0
         reaction_of_rigid_support = self.support_rows @ loads
-        reaction_of_spring = stiffness * (self.support_rows @ displacements)
+        reaction_of_spring = springs[:, np.newaxis] * (self.support_rows @ displacements)
         return np.where(is_held, reaction_of_rigid_support, reaction_of_spring)
 
     def compliance_gains(self, vector: FloatArray) -> FloatArray:

@@ -243,7 +243,10 @@ def _faces_near(mesh: StructureMesh, point: FloatArray) -> IntArray:
 def _nearest_on_faces(
     mesh: StructureMesh, point: FloatArray, cells: IntArray, face_numbers: IntArray
 ) -> _NearestPoints:
-    """Find the points of faces (n,), given by cell and index in it, nearest to a point."""
+    """Find on each of n faces the point that is nearest to a point (3,).
+
+    A face is given by its cell, in `cells` (n,), and its number in the cell.
+    """
     frames = mesh.kind.face_frames
     is_triangular = np.array([len(face) == 3 for face in mesh.kind.faces])
     is_triangle = is_triangular[face_numbers]
@@ -261,16 +264,16 @@ def _nearest_on_faces(
 def _nearest_on_face(
     corners: FloatArray, coordinates: FloatArray, metric: FloatArray
 ) -> FloatArray:
-    """Project points on convex faces of their planes.
+    """Move n points in planes to the nearest point of a convex face in their plane.
 
     Parameters
     ----------
     corners : (n, 4, 2) array
-        Corners of the faces; the last corner of a triangle occurs twice.
+        Corners of each face, in coordinates of its plane; a triangle has its last corner twice.
     coordinates : (n, 2) array
-        The points.
+        The points, in the same coordinates.
     metric : (n, 2, 2) array
-        The metric of each plane.
+        The metric of each plane's coordinates.
 
     Returns
     -------

@@ -173,7 +173,8 @@ class StructureMesh(CellMesh):
     ) -> _Content:
         """Return the members of a set; raise `MeshError` if it is missing or empty.
 
-        `kind` and `member` are the words for what the set holds, in the plural and in the singular.
+        `kind` and `member` are the words for what the set holds, in the plural and in the singular,
+        for the message; `where` is the key of the design that names the set.
         """
         members = _set_named(sets, name)
         if members is None:

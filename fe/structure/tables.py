@@ -266,7 +266,7 @@ class StructureDesign(DesignSection):
         return text
 
     def checks(self) -> Iterator[Check]:
-        """Yield the checks against names that do not fit together."""
+        """Yield the checks that names are unique where they must be, and that references exist."""
         # The names of states and controls are read together, and so are those of outputs.
         groups_of_tables = [
             ("parameter", "damage", "mass", "control"),
@@ -307,7 +307,7 @@ class StructureDesign(DesignSection):
     def wrong_ties(
         self, tables: tuple[str, ...], key: str, named_table: str, *, tied: str, untied: str
     ) -> Iterator[Check]:
-        """Yield the checks that rows of tables refer to names of another, and that each is used.
+        """Yield the checks that references to a table exist, and that each of its rows is used.
 
         Parameters
         ----------

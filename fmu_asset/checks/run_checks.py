@@ -296,7 +296,7 @@ class RunChecks:
         asset.step(**inputs)
 
     def _check_reset(self) -> CheckResult:
-        """Check that a run after a second reset equals the first run, and that the reset works."""
+        """Check that the FMU can be reset: that two runs, each after a reset, are equal."""
         with closing(self._asset()) as asset:
             outputs = self._run_from_start(asset)
             outputs_again = self._run_from_start(asset)

@@ -118,7 +118,7 @@ class RunningFmu:
     # ------------------------------------------------------------------ steps
 
     def step(self, inputs: InputsByRole) -> None:
-        """Make one step; if the FMU refuses it, request and time are as before."""
+        """Make one step with given inputs; if the FMU refuses it, request and time are restored."""
         request = self.host.request
         previous_request = request.tobytes()
         begin = self.time
@@ -231,7 +231,10 @@ class RunningFmu:
         return self.host.reply.tobytes()
 
     def finite_reply(self, remark: str = "") -> Float:
-        """Return the outputs (n_outputs,); raise an error with a remark if one is not finite."""
+        """Return the outputs (n_outputs,); raise `FmuOutputError` if one is not finite.
+
+        `remark` is added to its message.
+        """
         reply = self.host.reply
         # a fast test first: the sum of squares can be infinite for large values, too
         if math.isfinite(reply.dot(reply)):

@@ -104,7 +104,7 @@ class PatchFile:
         return [{"id": effect.id, "primitives": effect.patch.to_list()} for effect in self.effects]
 
     def for_gauges(self, gauge_count: int, patch_label: str = "The patch") -> PatchFile:
-        """Return the patch with the FMU's output in place of each channel.
+        """Replace each channel in the patch by the output of the FMU that it measures.
 
         Parameters
         ----------
@@ -131,12 +131,12 @@ class PatchFile:
     def _with_output(
         self, primitive: Primitive, outputs: Sequence[tuple[str, str]], effect_label: str
     ) -> Primitive:
-        """Return a primitive with the name of an FMU output instead of its channel.
+        """Replace the channel of a primitive by the name of an FMU output.
 
-        `self.channels` maps the channels of a measurement to outputs, given by name and quantity. A
-        primitive that acts on every channel stays as it is. A `PatchFileError` is raised if there
-        is no such output, if the primitive cannot act on its quantity, or if an FMU does not
-        simulate what it changes.
+        `self.channels` maps the channels of a measurement to outputs; `outputs` are the outputs of
+        the FMU, by name and quantity. A primitive that acts on every channel stays as it is. A
+        `PatchFileError` is raised if there is no such output, if the primitive cannot act on its
+        quantity, or if an FMU does not simulate what it changes.
         """
         label = f"{effect_label} has the primitive {primitive.kind!r}"
         _check_meaning_in_fmu(primitive, label)
@@ -202,7 +202,7 @@ def parse_patch(content: bytes, file_label: str = "The patch file") -> PatchFile
 
 
 def _patch_of_record(record: object, file_label: str) -> PatchFile:
-    """Return the patch in the parsed JSON of a patch file."""
+    """Check the parsed JSON of a patch file, and return the patch that it contains."""
     schema = record.get("schema") if isinstance(record, dict) else type(record).__name__
     if not isinstance(record, dict) or schema not in (SCHEMA, FIRST_SCHEMA):
         raise PatchFileError(f'{file_label} must have "schema": "{SCHEMA}", but has {schema!r}.')

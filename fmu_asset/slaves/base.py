@@ -168,7 +168,7 @@ class Slave:
         action: str,
         consequence: str,
     ) -> bool:
-        """Compute the outputs for the inputs and store them; return whether this succeeded.
+        """Compute the outputs for the present inputs, and store them; return whether this worked.
 
         The values of the first `checked_rows` rows must lie in their ranges. `action` and
         `consequence` say in messages what was tried and what a refusal means.
@@ -346,10 +346,10 @@ class Slave:
     # ------------------------------------------------------------------ refusals
 
     def _check_rows(self, first: int, end: int, consequence: str) -> bool:
-        """Refuse the call if a value is not finite or outside its range; return whether all are in.
+        """Return whether the values of the rows from `first` to before `end` are in their ranges.
 
-        The rows from `first` to before `end` are checked, up to the first fault. The message ends
-        with `consequence`: what happens because the call is refused.
+        If a value is outside or not finite, the call is refused with a message that ends with
+        `consequence`: what happens because of this.
         """
         values = self._values
         for index in range(first, end):

@@ -133,7 +133,7 @@ def _settable_names(wiring: Wiring) -> list[str]:
 
 
 def _name_with_hint(name: str, settable_names: list[str], components: list[str]) -> str:
-    """Return the name of an unused parameter, such as "wing.mass", with a hint at the mistake."""
+    """Add to the name of an unused parameter, such as "wing.mass", what may be wrong with it."""
     # names are compared with those of the same component, without its prefix
     prefixes = [f"{component}." for component in components if name.startswith(f"{component}.")]
     prefix = max(prefixes, key=len, default="")

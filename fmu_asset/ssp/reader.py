@@ -138,7 +138,7 @@ class _SystemReader:
     # ------------------------------------------------------------------ elements and connections
 
     def _read_system(self, system: XmlElement, path: str) -> None:
-        """Read a system and everything in it."""
+        """Read a system of the file, and everything in it, from its element at a path of names."""
         self._read_connectors(system, path)
         for element in system.iterfind("ssd:Elements/*", NAMESPACES):
             element_path = _joined_path(path, str(element.get("name")))
@@ -281,9 +281,9 @@ class _SystemReader:
             self._set(name, setting, path)
 
     def _set(self, name: str, setting: ComponentSetting, path: str) -> None:
-        """Set every parameter or connector that a name can mean in an element.
+        """Set every parameter or connector that a name can mean in the element at a path.
 
-        The name may begin with the path of an inner element, which ends at one of its dots.
+        A dot in the name may end the path of an inner element: `a.b.c` may be `c` in `a.b`.
         """
         candidates = [Endpoint(path, name)]
         for position, letter in enumerate(name):

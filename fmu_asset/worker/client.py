@@ -175,9 +175,8 @@ class WorkerInstance(Instance):
     def run(self, requests: Float, replies: Float, report: Callable[[int], object]) -> None:
         """Make N steps in one call of the worker.
 
-        The worker sends the replies in parts of one or more whole steps. So progress can be
-        reported between two parts, and the time limit of a step applies to each part, not to the
-        whole call.
+        The worker sends the replies in parts of one or more whole steps. Progress is reported after
+        each part, and the time limit of a step applies to a part, not to the whole call.
 
         Parameters
         ----------

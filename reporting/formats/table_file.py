@@ -278,7 +278,7 @@ def _parse_rows(text: str, separator: str | None, name: str, errors: TableErrors
 def _parse_separated_rows(
     lines: Sequence[str], separator: str, name: str, errors: TableErrors
 ) -> list[_Row]:
-    """Return the rows of lines, split at a separator outside quotes."""
+    """Split lines at a separator outside quotes, and return the rows of cells."""
     stream = io.StringIO("\n".join(lines))
     reader = csv.reader(stream, delimiter=separator, skipinitialspace=True)
     rows = []

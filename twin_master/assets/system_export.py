@@ -112,7 +112,7 @@ def export_scenario(
 
 
 def _with_packed_kind(scenario: Scenario, kind: PackedKind) -> Scenario:
-    """Return a scenario whose FMUs are packed from their designs as `kind`.
+    """Let a scenario pack FMUs from their designs as `kind`, Python or compiled.
 
     Raises
     ------

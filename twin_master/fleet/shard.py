@@ -43,10 +43,9 @@ from twin_master.scenario.schema import Scenario
 def flights_of_recordings(
     knowledge: Knowledge, recordings: Sequence[Sequence[FeedItem]]
 ) -> Flights:
-    """Return the beliefs and controls of B twins, given recordings of real assets.
+    """Let B twins follow recordings of real assets, each as `uav-twin watch` would do.
 
-    Each recording is processed as `uav-twin watch` would process it. A recording that cannot be
-    processed gives its reason in `failure`.
+    If a recording cannot be processed, the reason is in `failure` of its twin.
 
     Parameters
     ----------
@@ -73,7 +72,7 @@ def flights_of_recordings(
 
 
 def _history_of_recording(knowledge: Knowledge, messages: Sequence[FeedItem]) -> History:
-    """Return a twin's beliefs and controls, given the messages of one real asset.
+    """Let a twin follow the messages of one real asset, and return its beliefs and controls.
 
     If a late message changes the observation of an earlier step, all steps are filtered again with
     the final observations.
@@ -173,10 +172,12 @@ _unpacked_kit = lru_cache(maxsize=1)(Kit)
 
 
 def fly_shard(packed_kit: bytes, members: Sequence[Member]) -> ShardResult:
-    """Fly some twins of one group.
+    """Fly some twins of one group, in a process of the cluster, and return what is stored of them.
 
     Parameters
     ----------
+    packed_kit : bytes
+        The pickled kit with everything that these flights need.
     members : sequence of Member
         The B twins.
     """

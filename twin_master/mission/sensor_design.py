@@ -159,7 +159,10 @@ def _draw_under_control(
     control: int,
     random_numbers: np.random.Generator,
 ) -> DrawnReadings:
-    """Draw readings under a control, in all states or, if there are many, in some of them."""
+    """Draw about `SAMPLES` readings under a control, spread over the states.
+
+    If there are more states than this, they are drawn in some of the states only.
+    """
     if states <= SAMPLES:
         drawn_states = np.arange(states)
     else:
@@ -216,8 +219,8 @@ def choose_sensors(
 ) -> SensorDesign:
     """Choose the sensors with the most information about the state.
 
-    They are added one by one; then a chosen sensor is exchanged for another candidate as long as
-    that gains information.
+    First they are chosen one by one, each time the one that adds most information. Then a chosen
+    sensor is exchanged for another candidate as long as this gains information.
 
     Parameters
     ----------

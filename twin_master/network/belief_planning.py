@@ -117,7 +117,8 @@ class _Bounds:
                 control = int(np.argmax(self.upper.action_bound(belief)))
             # A difference one step later is discounted, so that a larger one is allowed there.
             allowed_gap /= max(float(self.problem.discount[control]), _LEAST_DISCOUNT)
-            # Rows of beliefs times the probability of their observation; so are the gaps there.
+            # A row for each observation. Beliefs, and so the gaps, are multiplied by its
+            # probability.
             weighted_beliefs = self.problem.next_beliefs(belief, control)
             weighted_gaps = self.upper.bound_at(weighted_beliefs) - self.lower_bound_at(
                 weighted_beliefs
@@ -174,10 +175,10 @@ def plan_on_belief(
     gap: float = 0.005,
     most_beliefs: int | None = None,
 ) -> BeliefPlan:
-    """Return a plan on the belief, found by heuristic search between a lower and an upper bound.
+    """Plan on the belief by heuristic search between a lower and an upper bound of the return.
 
-    The search ends when the bounds of the return from the prior are close, or when the largest
-    number of beliefs has been visited.
+    The search ends when the bounds at the prior are close, or when the largest number of beliefs
+    has been visited.
 
     Parameters
     ----------
@@ -193,16 +194,16 @@ def plan_on_belief(
     visited: list[Float] = []
     next_settling = _FIRST_SETTLING
     lower, upper = bounds.bounds_at(problem.prior, first)
-    most = most_beliefs or MOST_BELIEFS
-    while upper - lower > gap * max(abs(lower), abs(upper)) and len(visited) < most:
+    most_visits = most_beliefs or MOST_BELIEFS
+    while upper - lower > gap * max(abs(lower), abs(upper)) and len(visited) < most_visits:
         path = bounds.descend(problem.prior, first, _GAP_OF_DESCENT * (upper - lower))
         for belief in reversed(path):
             bounds.raise_lower_bound_at(belief)
             bounds.upper.improve_at(belief)
         visited += path
         if not most_beliefs:
-            most = MOST_BELIEFS if bounds.upper.can_settle() else MOST_UNSETTLED
-        if len(visited) >= min(next_settling, most):
+            most_visits = MOST_BELIEFS if bounds.upper.can_settle() else MOST_UNSETTLED
+        if len(visited) >= min(next_settling, most_visits):
             next_settling = int(_SETTLING_GROWTH * len(visited))
             bounds.upper.settle()
             for belief in visited * _RAISING_SWEEPS:
@@ -213,9 +214,10 @@ def plan_on_belief(
 
 
 def _policy_at(bounds: _Bounds, beliefs: Float) -> BeliefPolicy:
-    """Return a policy from the vectors that are best at some beliefs (B, S).
+    """Return the policy of the vectors that are best at some beliefs (B, S).
 
-    For each first control it has the vectors that are the largest of that control at one of them.
+    A vector has the return by state if one control is taken first. For each control, the policy has
+    the vectors that give the largest return at one of the beliefs.
     """
     vectors_by_control = []
     for control in range(len(bounds.problem.discount)):

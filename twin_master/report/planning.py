@@ -31,10 +31,11 @@ _TRIANGLE = np.array([[0.0, 0.0], [1.0, 0.0], [0.5, 0.866]])
 
 
 def corner_beliefs(model: GraphicalModel, factor: int) -> Float:
-    """Return the beliefs at the three corners of the triangle that is drawn for a factor, (3, S).
+    """Return the beliefs (3, S) at the corners of the triangle that is drawn for a factor.
 
-    In the first the factor is at its lowest level, in the second at its highest, and in the third
-    all of its levels are equally probable. The other factors are at their lowest levels.
+    At the first corner the factor is certainly at its lowest level, at the second at its highest,
+    and at the third all of its levels are equally probable. The other factors are at their lowest
+    levels.
 
     Parameters
     ----------
@@ -116,7 +117,7 @@ def design_figure(
     chosen_sensors: Sequence[int],
     outlines: Sequence[Float],
 ) -> Figure:
-    """Draw the information of chosen sensors, and their positions on the structure.
+    """Draw how much information chosen sensors give, and where they are on the structure.
 
     Parameters
     ----------

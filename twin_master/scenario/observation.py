@@ -58,7 +58,7 @@ class ModesSection(Section):
     changes between records and the error of the model [Hz for frequencies and 1 for the others]."""
 
     def checks(self) -> Iterator[Check]:
-        """Yield (has failed, message) for each rule on bands, numbers and features."""
+        """Yield (has failed, message) for each rule on bands, numbers and features of modes."""
         has_empty_band = any(high <= low for low, high in self.bands)
         yield (
             has_empty_band,

@@ -317,8 +317,7 @@ class Watch:
     def _write_step(self, step: MissionStep) -> JsonObject:
         """Write a step into the journal, with the notices that were pending; return its line.
 
-        If a notice has said that no step is received any more, another one says that steps are
-        received again.
+        If an earlier notice said that no steps arrive, a new one says that steps arrive again.
         """
         line = self.intake.journal_line(step, self.twin)
         notices = list(self.teaching.pending_notices)
@@ -357,16 +356,16 @@ class Watch:
         Most lines of steps are written without their large parts and without the state of teaching,
         which follows from the lines since the last one that has it.
         """
-        standing: JsonObject = {"begin": self.journal.size}
+        teaching_state: JsonObject = {"begin": self.journal.size}
         is_step = "filtered" in line
         is_whole = not is_step or is_whole_step(line["step"])
-        kept = _KEPT_AFTER_ALARM if self.teaching.has_alarm else KEPT_OF_SUSPICION
-        journal_line = short_record(line, is_whole=is_whole, kept_of_suspicion=kept)
+        kept_of_suspicion = _KEPT_AFTER_ALARM if self.teaching.has_alarm else KEPT_OF_SUSPICION
+        journal_line = short_record(line, is_whole=is_whole, kept_of_suspicion=kept_of_suspicion)
         if is_whole:
-            standing["teaching"] = self.teaching.as_record()
+            teaching_state["teaching"] = self.teaching.as_record()
         if "settled" in line and (line["step"] + 1) % KEPT_SNAPSHOT_STEPS == 0:
             journal_line["settled"] = line["settled"]
-        self.journal.append(journal_line | {"standing": standing}, large_parts(line))
+        self.journal.append(journal_line | {"standing": teaching_state}, large_parts(line))
         self._written_intake = line["intake"]
         self.teaching.take_line(line)
 
@@ -389,7 +388,7 @@ class Watch:
     def report_silence(self, send: Callable[[JsonObject], None]) -> None:
         """Send the last decision again, with a notice that no step has come for too long.
 
-        Nothing is sent before `watch.quiet_after_seconds` have passed, or a second time.
+        It is sent once, when `watch.quiet_after_seconds` have passed since the last step.
         """
         longest_silence = self.scenario.watch.quiet_after_seconds
         if longest_silence is None or self.is_quiet or self.seconds_since_step < longest_silence:

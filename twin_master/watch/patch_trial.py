@@ -74,7 +74,7 @@ class PatchOutcome:
 def patched_model(
     scenario: Scenario, patch: Path, from_step: int, progress: Progress | None = None
 ) -> BelievedModel:
-    """Return the model of a scenario with a patch.
+    """Return the model that a twin believes if the design of its scenario is patched.
 
     Parameters
     ----------
@@ -107,7 +107,7 @@ def outcome_of_patch(
     compared: ComparedSteps = NO_STEPS,
     progress: Progress | None = None,
 ) -> PatchOutcome:
-    """Return what a patch would change in the steps of a watch.
+    """Find out what a patch of the model would change in a watch.
 
     The steps from `from_step` on are filtered twice, without and with the patch.
 

@@ -205,23 +205,23 @@ def _state(damage: str, levels: list[float]) -> dict[str, object]:
 def _sensors(draft: FmuDraft, readings: FloatArray) -> dict[str, object]:
     """Return titles, noise and limit of the sensors, and the weight of the control's reward.
 
-    The limit is that of the sensor that rises most with the damage, relative to its value.
+    `readings` are (controls, levels, sensors), see `_probe`. The limit holds for the sensor whose
+    reading rises most with the damage, relative to its healthy value.
     """
-    hard_readings = readings[-1]
+    hard_readings = readings[-1]  # (levels, sensors), under the hardest control
     healthy = hard_readings[0]
-    worst = hard_readings[-1]
-    change = np.abs(worst - healthy)
-    size = np.abs(hard_readings).max(axis=0)
-    deviations = np.where(change > 0.0, _NOISE * change, 0.01 * size)
+    damaged = hard_readings[-1]
+    change = np.abs(damaged - healthy)
+    largest_readings = np.abs(hard_readings).max(axis=0)
+    deviations = np.where(change > 0.0, _NOISE * change, 0.01 * largest_readings)
     noise = [rounded_to(deviation) or 1.0 for deviation in deviations.tolist()]
-    rise = np.where(healthy > 0.0, (worst - healthy) / np.where(healthy > 0.0, healthy, 1.0), 0.0)
-    limited = int(np.argmax(rise))
-    limit = rounded_to(float(hard_readings[_LEVELS - 2, limited])) or 1.0
-    # The gentle control is the better one from the last level but one on, if that can be: what it
-    # saves at once there, and what it saves in later steps because it wears less, equal what it
-    # costs.
-    saved_at_once = (hard_readings - readings[0])[:, limited] / limit
-    loss_of_level = float(np.diff(hard_readings[: _LEVELS - 1, limited]).mean()) / limit
+    rise = np.where(healthy > 0.0, (damaged - healthy) / np.where(healthy > 0.0, healthy, 1.0), 0.0)
+    limited_sensor = int(np.argmax(rise))
+    limit = rounded_to(float(hard_readings[_LEVELS - 2, limited_sensor])) or 1.0
+    # If possible, the gentle control becomes the better one at the last level but one: there it
+    # saves as much as it costs, at once and in later steps, in which the FMU is worn less.
+    saved_at_once = (hard_readings - readings[0])[:, limited_sensor] / limit
+    loss_of_level = float(np.diff(hard_readings[: _LEVELS - 1, limited_sensor]).mean()) / limit
     saved_later = _GAMMA / (1.0 - _GAMMA) * (_WORSENING[1] - _WORSENING[0]) * loss_of_level
     saved = float(saved_at_once[_LEVELS - 3 : _LEVELS - 1].mean()) + max(saved_later, 0.0)
     weight = saved / (_REWARDS[1] - _REWARDS[0])
@@ -233,7 +233,7 @@ def _sensors(draft: FmuDraft, readings: FloatArray) -> dict[str, object]:
         "titles_text": "[" + ", ".join(f'"{title}"' for title in titles) + "]",
         "noise_text": f"standard_deviation = {noise}",
         "limit_text": f"health_limit = {limit}",
-        "limited_text": f"health_sensors = [{limited + 1}]",
+        "limited_text": f"health_sensors = [{limited_sensor + 1}]",
         "scale_text": f"error_scale = {noise}",
         "control_weight": rounded_to(weight, 3) if weight > 0.0 else 1.0,
     }

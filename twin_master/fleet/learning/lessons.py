@@ -26,9 +26,9 @@ Record = JsonRecord
 def write_learnt(path: Path, folder: Path, record: Record) -> Path:
     """Write `learnt.toml`, whose tables replace those of a scenario.
 
-    Its first tables are for a new asset: the mean probabilities of worsening that the groups share,
-    and the noise and the distribution of the parameter of the group with the most twins. If there
-    are several groups, each has its own tables as well. All numbers are in SI units.
+    The first tables are for a new asset. They have the mean probabilities of worsening that the
+    groups share, and the noise and the distribution of the parameter of the group with most twins.
+    If there are several groups, each has tables of its own as well. All numbers are in SI units.
 
     Parameters
     ----------

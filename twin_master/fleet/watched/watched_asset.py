@@ -25,12 +25,14 @@ def read_standing(folder: Path) -> JsonObject:
     Returns
     -------
     dict
-        `assets` and `failures`, both empty if nothing was watched. For each asset, `last` is its
-        last decision, None before the first one; `alarms` and `refused` are the numbers of alarms
-        and of refused messages; `leaving` is the probability that its control changes within the
-        scenario's `prediction_steps`, and `severity` the severity of its damage. The last two are
-        None if no state of the model explains the observations. `failures` holds for each asset
-        that is not watched the reason.
+        `assets` and `failures`, both empty if nothing was watched. `failures` has the reason for
+        each asset that is not watched. `assets` has for each watched asset
+
+        - `last`: its last decision; None before the first one;
+        - `alarms` and `refused`: the numbers of alarms and of refused messages;
+        - `leaving`: the probability that its control changes within the scenario's
+          `prediction_steps`, and `severity`, that of its damage; both are None if no state of the
+          model explains the observations.
 
     Raises
     ------
