@@ -91,7 +91,11 @@ class Declaration:
 
 
 def _declare_unit(unit: DeclaredUnit, name: str, display_unit: str | None) -> None:
-    """Complete the declaration of a unit from its name and a display unit."""
+    """Add the meaning of a unit to its declaration: exponents, factor, offset and a display unit.
+
+    The meaning is that of the name, such as "N/mm". A unit of another name is declared by its name
+    alone, and stays unchanged.
+    """
     meaning = conversion_of(name)
     if meaning is None:
         return

@@ -73,7 +73,8 @@ def suspects(
 def _rows(static: "Plan", with_releases: "Plan") -> list[dict[str, str]]:
     """Return a row for each suspicion: its place, the smallest visible size, and look-alikes.
 
-    The first plan has static loads alone, the second one releases as well.
+    The first plan has static loads alone, the second one releases as well. The smallest size is
+    that under static loads; a suspicion that these cannot show "needs a release".
     """
     rows = []
     for at_rest, released in zip(

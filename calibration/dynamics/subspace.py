@@ -137,10 +137,11 @@ class Subspace:
         _, self._singular_values, self._right_vectors = np.linalg.svd(_hankel(correlation))
 
     def _realisation(self, correlation: Float, basis: Float) -> _Realisation:
-        """Return the modal form of the system with some correlations.
+        """Return poles and mode shapes of the system that has the given correlations.
 
-        The basis (L C, n) projects the Hankel matrix on n states: their product is the
-        observability matrix.
+        This is stochastic subspace identification. `correlation` (2 L, C, C) has the correlations
+        of C channels at successive lags. `basis` (L C, n) projects their Hankel matrix on n states;
+        the product is the observability matrix.
         """
         channels = correlation.shape[1]
         observability = _hankel(correlation) @ basis

@@ -46,10 +46,10 @@ TABLE_NAME = "table_1.csv"
 
 
 def write_wing_folder(calibration: WingCalibration, folder: Path, *, report: bool = True) -> Path:
-    """Write a calibrated wing to a folder: `calibration.nc`, Table 1, and a report if wanted.
+    """Write a calibrated wing to a folder, and return the path of its file `calibration.nc`.
 
-    The report is a page with figures, and the wing and its modes as files for ParaView. The path of
-    `calibration.nc` is returned.
+    The folder also has Table 1 of the paper as computed here and, if `report` is true, a page with
+    figures, and the wing and its modes as files for ParaView.
 
     Raises
     ------
@@ -74,7 +74,10 @@ def write_wing_folder(calibration: WingCalibration, folder: Path, *, report: boo
 
 
 def _wing_sections(calibration: WingCalibration, fields: WingFields, folder: Path) -> list[Section]:
-    """Return the sections on a wing for the page of its calibration; write their figures."""
+    """Return the sections on a wing for the page of its calibration.
+
+    Their figures are written to `folder`.
+    """
     trials = calibration.lab.trials
     ring_down: Block = WORDS.say("no_record")
     if trials is not None:
@@ -104,23 +107,26 @@ def _origins(origins: Sequence[StepOrigin]) -> list[Block]:
 
 
 def _comparison_with_paper(calibration: WingCalibration, folder: Path) -> list[Block]:
-    """Return Table 1, the load test, and the posteriors beside those of the paper."""
+    """Return the page's parts on Table 1, the load test, and the posteriors beside the paper's.
+
+    The figures are written to `folder`.
+    """
     load_test = WORDS.figure("load_test", calibration_figure(calibration.static))
     rows = [
         *_posterior_rows("tailored model", calibration.static),
         *_posterior_rows("line of the paper, eq. (14)", calibration.static_published),
     ]
     columns, names = unmeasured_parameters(calibration.joint)
-    sets = [
+    sample_sets = [
         ("joint posterior", calibration.joint.samples[:, columns]),
         ("the paper's procedure", calibration.paper.samples[:, columns]),
     ]
     authors = calibration.lab.authors
     remark = ""
     if authors is not None:
-        sets.append(("authors' model", authors.samples))
+        sample_sets.append(("authors' model", authors.samples))
         remark = "; grey are the authors’ published samples"
-    procedure = WORDS.figure("procedure", corner_figure(names, sets), authors=remark)
+    procedure = WORDS.figure("procedure", corner_figure(names, sample_sets), authors=remark)
     return [
         printed_table_1(calibration.table_1),
         save_figure(load_test, folder),

@@ -58,9 +58,10 @@ class Questionnaire:
     def ask(
         self, option: str, subject: str, expected_answer: str, choices: Collection[str] = ()
     ) -> str:
-        """Return an answer; if there is none, note an open question and return an empty text.
+        """Return the user's answer by an option about a column or file.
 
-        An answer about exactly this column or file comes before one about all.
+        An answer about exactly this column or file comes before one about all. If there is none,
+        an open question is noted, and an empty text is returned.
 
         Parameters
         ----------
@@ -99,7 +100,7 @@ class Questionnaire:
         expected_answer: str,
         choices: Collection[str] = (),
     ) -> str:
-        """Return an answer; if there is none, note the default as assumed and return it.
+        """Return the user's answer; if there is none, note the default as assumed and return it.
 
         Parameters and errors are those of `ask`.
         """

@@ -19,7 +19,7 @@ class TableClock(NamedTuple):
 
 
 def find_clocks(columns: Sequence[LaboratoryColumn]) -> tuple[TableClock, ...]:
-    """Decide at the times of which time column each reading column of a table was read.
+    """Return each time column of a table with the reading columns that were read at its times.
 
     The names of the columns show it, as in `acc2` and `time2`, or their order: every time column
     stands before its reading columns, or every one stands after them. If names and order both show

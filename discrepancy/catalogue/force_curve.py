@@ -43,10 +43,11 @@ VARIABLES: tuple[Variable, ...] = ("displacement", "velocity")
 
 @cache
 def curve_functions(correlation_length: float) -> FloatArray:
-    """Return the K functions (P, K) of the expansion of a curve with unit variance at P points.
+    """Return K functions at P points (P, K), whose sum with random amplitudes is a random curve.
 
-    The functions are the eigenvectors of the squared exponential covariance, largest variance
-    first, each multiplied by the prior standard deviation of its amplitude. Functions with less
+    With standard normal amplitudes the curve is a Gaussian process with unit variance and squared
+    exponential covariance (Karhunen-Loève expansion). The functions are the eigenvectors of this
+    covariance, largest variance first, times the square root of their variance. Those with less
     than `NEGLECTED_VARIANCE` of the total variance are left out.
 
     Parameters
@@ -92,9 +93,11 @@ def variance_along_curve(variable: Variable, values: FloatArray, force: FloatArr
     points = curve_points(variable, float(values.min()), float(values.max()))
     functions = curve_functions(CORRELATION_LENGTHS[0])
     # the functions at the values of the variable (N, K)
-    at_values = np.column_stack([np.interp(values, points, shape) for shape in functions.T])
-    amplitudes = np.linalg.lstsq(at_values, force, rcond=None)[0]
-    unexplained = force - at_values @ amplitudes
+    functions_at_values = np.column_stack(
+        [np.interp(values, points, shape) for shape in functions.T]
+    )
+    amplitudes = np.linalg.lstsq(functions_at_values, force, rcond=None)[0]
+    unexplained = force - functions_at_values @ amplitudes
     return 1.0 - float(unexplained @ unexplained) / float(force @ force)
 
 

@@ -104,8 +104,9 @@ class LawForce:
 def mean_force(law: FloatArray, x: float, speed: float, half_width: float) -> float:
     """Return the mean of a law of the speed over a window of speeds, at a position of its port.
 
-    The law is a power of the speed above a level, so that the mean is a difference of the next
-    higher powers, or a table, so that it is a difference of integrals of straight lines.
+    The mean is the difference of the law's integral between both ends of the window, over its
+    width. The law is either a table, or a power of the speed above a level, which may be one-sided
+    (zero below the level).
 
     Parameters
     ----------
@@ -208,9 +209,10 @@ def _compiled_fill() -> Callable[..., None]:
 def force_and_tangents(
     law: PortForce, time: FloatArray, motion: PortMotion, speed_window: float
 ) -> LawForce:
-    """Return the force of a law along a motion of its port, and its tangents.
+    """Return the force of a law along a motion of its port, with its derivatives (tangents).
 
-    Both are zero outside of the law's windows in time.
+    The derivatives are those by position and speed. All are zero outside of the times in which the
+    law acts.
 
     Parameters
     ----------

@@ -74,7 +74,11 @@ class ReadingChanges:
     def _readings_of_sensor_errors(
         self, trial: PortedTrial, trajectory: Trajectory, trial_index: int, sensors: ModelPatch
     ) -> FloatArray:
-        """Return the change (N, C) of the readings by errors of sensors, divided by the noise."""
+        """Return the change (N, C) of the readings by errors of sensors, divided by the noise.
+
+        The errors act on the true values at the sensors: the model's response plus what the forces
+        at ports add to it.
+        """
         problem = self.problem
         data = problem.trials[trial_index]
         # a thinned trial has some of the samples of the record

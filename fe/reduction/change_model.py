@@ -130,8 +130,12 @@ def _mass_arrays(places: Sequence[MassCandidate], columns: FloatArray) -> dict[s
 
 
 def _loss_arrays(patches: Sequence[LossCandidate], columns: FloatArray) -> dict[str, Any]:
-    """Return the fields on patches that may lose stiffness."""
-    lower = np.tril_indices(columns.shape[1])
+    """Return the fields of `ChangeableModel` on patches of the structure that may lose stiffness.
+
+    The stiffness of each patch is projected on the `columns` of the reduced basis. As the result is
+    symmetric, only its lower triangle is stored.
+    """
+    lower_triangle = np.tril_indices(columns.shape[1])
     patch_numbers = []
     term_numbers = []
     triangles = []
@@ -140,8 +144,8 @@ def _loss_arrays(patches: Sequence[LossCandidate], columns: FloatArray) -> dict[
             (projected,) = _projected((matrix,), columns)
             patch_numbers.append(number)
             term_numbers.append(term)
-            triangles.append(projected[lower])
-    rows, _ = lower
+            triangles.append(projected[lower_triangle])
+    rows, _ = lower_triangle
     return {
         "loss_places": tuple(patch.name for patch in patches),
         "loss_patch": np.array(patch_numbers, dtype=np.int64),
@@ -185,17 +189,21 @@ def _patch_of_gauges(structure: AffineStructure, patches: Sequence[LossCandidate
 
 
 def _load_accelerations(structure: AffineStructure, load_factors: IntArray) -> FloatArray:
-    """Return the acceleration (L, 3) by each load, per unit of its control."""
+    """Return the acceleration (L, 3) that each load applies, per unit of its control.
+
+    A row of `load_factors` has the numbers of the control and of the free mass to which the load is
+    proportional, counted from one; 0 means none. The row of a load on a free mass is zero.
+    """
     no_acceleration = np.zeros(3)
-    of_control: dict[int, FloatArray] = {}
+    acceleration_of_control: dict[int, FloatArray] = {}
     controls = [None, *structure.controls]
     for load in structure.design.load:
         if load.acceleration is not None:
             number = controls.index(structure.loads[load.name])
-            earlier = of_control.get(number, no_acceleration)
-            of_control[number] = earlier + np.asarray(load.acceleration)
+            acceleration_so_far = acceleration_of_control.get(number, no_acceleration)
+            acceleration_of_control[number] = acceleration_so_far + np.asarray(load.acceleration)
     rows = [
-        of_control.get(control, no_acceleration) if mass == 0 else no_acceleration
+        acceleration_of_control.get(control, no_acceleration) if mass == 0 else no_acceleration
         for control, mass in load_factors.tolist()
     ]
     return np.array(rows).reshape(-1, 3)

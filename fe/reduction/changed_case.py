@@ -52,25 +52,27 @@ def case_error(
         The reduced mode shapes on all unknowns.
     """
     structure = case.structure
-    # statics
+    # statics: outputs (O, L) of the full and of the reduced model under each load
     factors = terms.load_factors.tolist()
     load_numbers = [factors.index(row) for row in held_terms.load_factors.tolist()]
     outputs = terms.outputs.T @ case.full_solution(terms.loads[:, load_numbers])
     displacements = structure.basis @ structure.static(structure.basis.T @ model.whole_load.T)
-    reduced = model.whole_output[: len(outputs)] @ displacements
+    reduced_outputs = model.whole_output[: len(outputs)] @ displacements
     largest_error = 0.0
     for group in terms.groups:
         largest = np.abs(outputs[group]).max(axis=0)
-        difference = np.abs(reduced[group] - outputs[group]).max(axis=0)
+        difference = np.abs(reduced_outputs[group] - outputs[group]).max(axis=0)
         responds = largest > 0.0
         largest_error = max(
             largest_error, float((difference[responds] / largest[responds]).max(initial=0.0))
         )
-    # frequencies by the Rayleigh quotient of the improved modes
+    # Frequencies: with the shapes improved by inverse iteration, K u = M phi, the Rayleigh quotient
+    # is omega^2 = u^T K u / u^T M u = u^T M phi / u^T M u.
     inertia = case.mass @ shapes
-    improved = case.full_solution(inertia)
-    squares = np.sum(improved * inertia, axis=0)
-    squares = squares / np.sum(improved * (case.mass @ improved), axis=0)
+    improved_shapes = case.full_solution(inertia)
+    stiffness_products = np.sum(improved_shapes * inertia, axis=0)
+    mass_products = np.sum(improved_shapes * (case.mass @ improved_shapes), axis=0)
+    squares = stiffness_products / mass_products
     frequency = np.sqrt(squares) / (2.0 * np.pi)
     frequency_errors = np.abs(structure.modes.frequency / frequency - 1.0)
     return max(largest_error, float(frequency_errors.max()))

@@ -57,7 +57,10 @@ def reduce_structure(
     settings: StructureSettings | None = None,
     progress: Progress | None = None,
 ) -> Reduction:
-    """Make the reduced model of a structure.
+    """Return the reduced model of a structure, with what its making has found.
+
+    The modes are reduced first. The static basis then grows until the bound of its error is below
+    the tolerance.
 
     Parameters
     ----------
@@ -184,9 +187,11 @@ class MeasuredErrors:
 def measured_errors(
     structure: AffineStructure, model: ReducedModel, states: int, seed: int = 2021
 ) -> MeasuredErrors:
-    """Compare a reduced model with the full one at random states.
+    """Return the largest errors of a reduced model, measured at random states by the full model.
 
-    Each control has its nominal value, or the value one if that is zero.
+    Each control has its nominal value, or the value one if that is zero. Frequencies are compared
+    at the first and the last state only. A state is "broken" if one of its errors exceeds the bound
+    that the reduced model gives for it.
 
     Parameters
     ----------

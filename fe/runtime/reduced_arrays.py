@@ -293,10 +293,11 @@ class CertifiedSolver:
         self._latest_dual: tuple[tuple[bytes, Losses], _DualSolution] | None = None
 
     def _dual_solution(self, theta: FloatArray, losses: Losses) -> _DualSolution:
-        """Return the Galerkin solutions of the outputs' dual problems from the nearest anchor.
+        """Return the approximate dual solutions of the outputs in one state of the structure.
 
-        The last solution is kept, since successive loads often act on a structure in the same
-        state.
+        They are Galerkin solutions in the basis of one of the anchors, the states for which such
+        bases are stored: for each loss, the anchor on the same side of `dual_split`. The last
+        solution is kept, since successive loads often act on a structure in the same state.
         """
         key = (theta.tobytes(), losses)
         if self._latest_dual is not None and self._latest_dual[0] == key:
@@ -334,12 +335,12 @@ class CertifiedSolver:
         change = (theta - self._reference)[:-1]
         changes = np.multiply.outer(change, coordinates).ravel()
         residual = self._residual @ np.concatenate((load, changes))
-        outside = self._allowance * sqrt(coordinates @ coordinates)
+        neglected_residual = self._allowance * sqrt(coordinates @ coordinates)
         # Bounds of the outputs. For affine positive semi-definite terms the coercivity alpha in the
         # reference norm is at least the smallest ratio of coefficients (min-theta approach).
         dual = self._dual_solution(theta, losses)
         coercivity = min((theta / self._reference).tolist())
-        error_norm = (sqrt(residual @ residual) + outside) / coercivity
+        error_norm = (sqrt(residual @ residual) + neglected_residual) / coercivity
         correction = np.abs(dual.correction @ residual)
         bounds = error_norm * dual.residual_norm + correction
         outputs = self._output @ coordinates

@@ -176,7 +176,9 @@ class SensorDrift(Sensor):
     """Quantity of the channels if `channel` is "*"; empty for all quantities."""
 
     def error(self, record: SensorRecord) -> SensorError:
-        """Return the drift of the zero at each sample.
+        """Return the drift of the zero, amplitude (t / time)^exponent, at each sample.
+
+        The time t runs from the begin of the campaign.
 
         Raises
         ------
@@ -193,9 +195,8 @@ class SensorDrift(Sensor):
             return SensorError(
                 self.amplitude * ratio, np.full_like(ratio, self.amplitude / self.time)
             )
-        drifting = (
-            ratio > 0.0
-        )  # no drift at and before the start, where 0^exponent may be 1 or infinite
+        # no drift at and before the start, where 0^exponent may be 1 or infinite
+        drifting = ratio > 0.0
         safe_ratio = np.where(drifting, ratio, 1.0)
         value = np.where(drifting, self.amplitude * safe_ratio**self.exponent, 0.0)
         rate = np.where(drifting, self.exponent * value / (safe_ratio * self.time), 0.0)

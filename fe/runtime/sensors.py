@@ -172,10 +172,12 @@ def _rotate_gauges(
     transverse: FloatArray | None,
     shear: FloatArray | None,
 ) -> None:
-    """Turn strain gauges in the plane of the skin; readings and rates (N, C) change in place.
+    """Change the readings and rates (N, C) in place to those of gauges that are turned.
 
-    The strain in a direction at the angle a is eps cos^2 a + eps_t sin^2 a + gamma sin a cos a. If
-    the transverse or shear strains are missing, `InvalidPatchError` is raised.
+    A gauge turned by the angle a in the plane of the skin reads the strain eps cos^2 a +
+    eps_t sin^2 a + gamma sin a cos a, with the strain eps along its nominal direction, `transverse`
+    strain eps_t and `shear` strain gamma. If one of the latter is missing, `InvalidPatchError` is
+    raised. The angles of several `sensors` that turn the same gauge add up.
     """
     angles = np.zeros(len(record.channels))
     for sensor in sensors:

@@ -88,7 +88,7 @@ def step_boundaries(
     """
     inner_times = np.asarray(switching_times, dtype=np.float64)
     inner_times = inner_times[(inner_times > time[0]) & (inner_times < time[-1])]
-    # most are stamps, as a sampled load has a corner at each of its samples
+    # times that are no stamps; most are, as a sampled load has a corner at each of its samples
     between_stamps = inner_times[time[np.searchsorted(time, inner_times)] != inner_times]
     if len(between_stamps):
         all_times = np.union1d(time, between_stamps)

@@ -96,16 +96,19 @@ class UnitResponses:
             return ModalSystem(self.omega, damping)
         names = self.structure.laws.ports
         rows = self.participation[:, self.load_count :].T
-        # residual flexibility: static minus modal compliance; below the limit it is rounding
+        # residual flexibility: what the modes that are left out add, which is the static
+        # compliance minus that of the modes; below 1e-9 of the former it is rounding
         flexibility = np.diag(self.port_compliance)
-        residual = flexibility - np.sum((rows / self.omega) ** 2, axis=1)
+        residual_flexibility = flexibility - np.sum((rows / self.omega) ** 2, axis=1)
         is_flexible = np.array(
             [name not in self.structure.rigid_ports for name in names], dtype=bool
         )
-        residual = np.where((residual > 1e-9 * flexibility) & is_flexible, residual, 0.0)
+        residual_flexibility = np.where(
+            (residual_flexibility > 1e-9 * flexibility) & is_flexible, residual_flexibility, 0.0
+        )
         # several laws may act at one port
         row_of_port = dict(zip(names, rows, strict=True))
-        residual_of_port = dict(zip(names, residual.tolist(), strict=True))
+        residual_of_port = dict(zip(names, residual_flexibility.tolist(), strict=True))
         return ModalSystem(
             angular_frequency=self.omega,
             damping=damping,

@@ -39,7 +39,7 @@ def share_over_couplings(
         If a coupling names something that the deck does not have.
     """
     nodes_of_reference = dict(_distributing_couplings(jobs.model))
-    shared = []
+    loads_without_references = []
     for load in loads:
         on_references = {
             dof: value
@@ -56,8 +56,8 @@ def share_over_couplings(
             moments.pop(dof, None)
             for coupled_dof, force in unit_forces.items():
                 forces[coupled_dof] = forces.get(coupled_dof, 0.0) + value * force
-        shared.append(replace(load, forces=forces, moments=moments))
-    return shared
+        loads_without_references.append(replace(load, forces=forces, moments=moments))
+    return loads_without_references
 
 
 def _distributing_couplings(model: LinearModel) -> Iterator[tuple[int, list[int]]]:
@@ -85,29 +85,41 @@ def _distributing_couplings(model: LinearModel) -> Iterator[tuple[int, list[int]
 def _forces_of_unit(
     jobs: CalculixJobs, blocks: Sequence[KeywordBlock], dof: Dof, nodes: Sequence[int]
 ) -> NodalForces:
-    """Return the forces at coupled nodes for a unit load; empty if CalculiX prints none."""
+    """Return the forces at coupled nodes by which a coupling transmits a unit load.
+
+    CalculiX computes them: all other nodes are held, everything else that binds nodes is removed,
+    and the forces at the coupled nodes are printed. Forces that are zero but for rounding are left
+    out; the result is empty if CalculiX fails.
+
+    Parameters
+    ----------
+    dof : (int, int)
+        The reference node, and the direction of the load.
+    nodes : sequence of int
+        The coupled nodes.
+    """
     model = jobs.model
     reference, direction = dof
     free_nodes = {reference, *nodes}
-    held = [
+    held_motions = [
         HeldMotion(node, axis)
         for node in model.mesh.points
         if node not in free_nodes
         for axis in TRANSLATIONS
     ]
-    alone = replace(jobs, model=replace(model, held=held))
+    jobs_with_others_held = replace(jobs, model=replace(model, held=held_motions))
     unit_load = DeckLoad("unit", lines=["*CLOAD", f"{reference},{direction},1."])
     try:
-        (table,) = alone.displacements(
+        (table,) = jobs_with_others_held.displacements(
             [unit_load], _without_bonds(blocks, reference), preloaded=False, quantity="RF"
         )
     except CalculixError:
         return {}
-    largest = max(float(np.abs(table[node]).max()) for node in nodes)
+    largest_force = max(float(np.abs(table[node]).max()) for node in nodes)
     forces = {}
     for node in dict.fromkeys(nodes):
         for axis, force in zip(TRANSLATIONS, table[node].tolist(), strict=True):
-            if abs(force) > _SMALLEST_FORCE * largest:
+            if abs(force) > _SMALLEST_FORCE * largest_force:
                 forces[node, axis] = force
     return forces
 

@@ -78,9 +78,10 @@ class DeckLoads:
 
 
 def read_loads(model: LinearModel) -> DeckLoads:
-    """Read the loads of a deck: those of one kind in one step are one load.
+    """Return the loads of a deck, and remarks on what was left out.
 
-    Loads of all kinds of steps are read, with the values of their lines, without time curves.
+    All forces of one kind in one step, such as its pressures, are one load. Steps of any kind are
+    read. Values are those of the lines: curves over time do not count.
     """
     loads: list[DeckLoad] = []
     remarks: list[str] = []
@@ -165,6 +166,7 @@ def _nodal_load(model: LinearModel, where: str, values: Sequence[str]) -> DeckLo
     if transformed.intersection(nodes):
         raise NotReadError("a force in the axes of *TRANSFORM is left out; give it along x, y, z")
     axisymmetric = model.mesh.axisymmetric_nodes
+    # a load on an axisymmetric model is that of the whole ring, of which one sector is computed
     at_nodes = {
         (node, direction): value / _SECTORS if node in axisymmetric else value for node in nodes
     }

@@ -83,10 +83,10 @@ class Body(Generic[Mesh]):
 
     @property
     def stiffness_terms(self) -> tuple[StiffnessTerm, ...]:
-        """Stiffness of each part, in their order.
+        """The stiffness terms of the structure: one matrix for each pair of parameter and region.
 
-        Springs are added to the part of their parameter and no region, which is made if there is
-        none.
+        Springs of the supports are added to the term of the parameter that scales them and of no
+        region. If there is no such term, it is appended.
         """
         terms = {}
         for number, pair in enumerate(self.parts):

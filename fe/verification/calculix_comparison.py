@@ -65,7 +65,9 @@ class _PrintedResults(NamedTuple):
 
 
 def agreement(deck: CalculixDeck, folder: Path, modes: int = 6) -> Agreement:
-    """Solve each load of a model alone, and its lowest modes, by our code and by CalculiX.
+    """Return how far solutions of this program and of CalculiX agree for one model.
+
+    Both solve each load alone, and compute the lowest natural frequencies.
 
     Parameters
     ----------
@@ -83,15 +85,15 @@ def agreement(deck: CalculixDeck, folder: Path, modes: int = 6) -> Agreement:
         If CalculiX is not installed or fails.
     """
     printed_results = _static_results(deck, folder)
-    our_frequencies, _ = natural_frequencies(deck.structure, modes, deck.values)
-    their_frequencies = _calculix_frequencies(deck, folder, modes)
+    frequencies, _ = natural_frequencies(deck.structure, modes, deck.values)
+    calculix_frequencies = _calculix_frequencies(deck, folder, modes)
     system = deck.structure.system_at(deck.values)
     factors = Factorisation(system.stiffness)
     differences = {}
     for (name, step), results in zip(deck.loads.items(), printed_results, strict=True):
         displacement = factors.solve(step.load)
         differences[name] = _differences(deck, displacement, results)
-    return Agreement(differences, our_frequencies, their_frequencies)
+    return Agreement(differences, frequencies, calculix_frequencies)
 
 
 def _prints_strains(deck: CalculixDeck) -> bool:
@@ -147,27 +149,29 @@ def _differences(
 ) -> dict[str, float]:
     """Return the relative differences from CalculiX for one load, see `Agreement.loads`.
 
-    `displacement` (n,) is our solution for the free unknowns [m].
+    `displacement` (n,) is the solution of this program for the free unknowns [m].
     """
-    our_probes = deck.probes @ displacement
-    our_nodes = deck.structure.full_displacement(displacement)
+    probe_outputs = deck.probes @ displacement
+    nodal_displacements = deck.structure.full_displacement(displacement)
     differences = {
-        "nodal displacements": _relative_difference(printed_results.displacements, our_nodes)
+        "nodal displacements": _relative_difference(
+            printed_results.displacements, nodal_displacements
+        )
     }
     gauge_count = len(deck.structure.gauges)
     probes_by_quantity = {
         "gauge strains": slice(0, gauge_count),
-        "displacement outputs": slice(gauge_count, len(our_probes)),
+        "displacement outputs": slice(gauge_count, len(probe_outputs)),
     }
     for quantity, probe_rows in probes_by_quantity.items():
-        if len(our_probes[probe_rows]):
+        if len(probe_outputs[probe_rows]):
             difference = _relative_difference(
-                printed_results.probes[probe_rows], our_probes[probe_rows]
+                printed_results.probes[probe_rows], probe_outputs[probe_rows]
             )
             differences[quantity] = difference
     if _prints_strains(deck):
-        our_strains = deck.body.mesh.strains(our_nodes, INTEGRATION_POINTS).reshape(-1, 6)
-        our_strains[:, 3:] *= 0.5  # engineering to tensor shear strains, as CalculiX prints them
-        difference = _relative_difference(printed_results.strains, our_strains[:, CALCULIX_STRAINS])
+        strains = deck.body.mesh.strains(nodal_displacements, INTEGRATION_POINTS).reshape(-1, 6)
+        strains[:, 3:] *= 0.5  # engineering to tensor shear strains, as CalculiX prints them
+        difference = _relative_difference(printed_results.strains, strains[:, CALCULIX_STRAINS])
         differences["strains at integration points"] = difference
     return differences

@@ -288,7 +288,12 @@ class CoupledFmus(Host):
         self._at_different_times = False
 
     def step(self) -> None:
-        """Make the step of the system that the request describes."""
+        """Step all components once, in the order of the schedule.
+
+        The request has the time, the step size and the inputs of the system. A group is a component
+        alone, or a cycle of components, whose step may be iterated. With Jacobi's method a
+        component takes the outputs that the others had before the step, else the latest ones.
+        """
         if self._at_different_times:
             raise FmuStateError(
                 "A step or a restoration failed, and the FMUs no longer stand at the same time; "

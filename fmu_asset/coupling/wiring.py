@@ -175,9 +175,10 @@ class Wiring:
         return variable
 
     def _connector(self, end: Endpoint, kinds: tuple[str, ...], role: str) -> VariableInfo:
-        """Return a connector of the system; raise an error unless its kind may stand there.
+        """Return the connector of the system at one end of a connection.
 
-        `role` names its end of the connection, for the message.
+        A `CouplingError` is raised if there is none, or it is not of one of the `kinds` that may
+        stand there. `role` is the name of this end in the message, such as "the target".
         """
         kind = self._connector_kinds.get(end.variable)
         if kind is None:
@@ -194,7 +195,11 @@ class Wiring:
         return VariableInfo(end.variable, 0, kind="", causality=kind, unit=unit)
 
     def _connect(self, connection: Connection, source_of_target: dict[Endpoint, Endpoint]) -> None:
-        """Check a connection and add it to `feeds` or `ends`, and to the sources by target."""
+        """Check a connection, and record it.
+
+        One between components is added to `feeds`, one to or from a connector of the system to the
+        `ends` of this connector. In both cases its source is recorded in `source_of_target`.
+        """
         source, target = connection.source, connection.target
         if target in source_of_target:
             raise CouplingError(two_sources_sentence(target, source_of_target[target], source))

@@ -244,7 +244,10 @@ class ModelExchange(FmuInstance):
         return bytes(self._values)[16:]
 
     def _send_inputs(self) -> None:
-        """Set the inputs of a new step; a jump of their values is an event."""
+        """Set the inputs of a new step, and restart the solver if they or their slopes jump.
+
+        A jump of the values is an event, which the FMU must handle; a jump of the slopes is not.
+        """
         slope_changes = False
         if self._linear_inputs is not None:
             previous_slopes = bytes(self._linear_inputs.slopes)

@@ -16,9 +16,11 @@ from .variables import FmuVariable
 
 
 def later_outputs(table: Sequence[FmuVariable], roles: StructureRoles) -> tuple[slice, ...]:
-    """Return the rows of the outputs that are computed only when they are read, by group.
+    """Return the rows of the outputs that are computed only when they are read, in three groups.
 
-    The groups are `BOUND`, `POINT_OR_BOUND` and `MODES` of `behaviour`.
+    They are, in this order: the bound of the strain error; the displacement of the load point or,
+    without one, the bound of the displacement error; frequencies and damping ratios of the modes.
+    `BOUND`, `POINT_OR_BOUND` and `MODES` of `behaviour` are the indices of the groups.
     """
     reference = {row.name: row.reference for row in table}
     bound_row = reference["strain_error_bound"]

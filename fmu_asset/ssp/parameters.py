@@ -137,9 +137,10 @@ class ParameterReader:
         binding_label: str,
         unmapped_names: list[str],
     ) -> dict[str, ComponentSetting]:
-        """Return the values of a parameter set by the names that a mapping gives them.
+        """Return the values of a parameter set under the names that a mapping gives them.
 
-        Values that the mapping does not name are dropped.
+        A mapping has entries "source name, target name", and may scale the value. Values that it
+        does not name are dropped.
 
         Parameters
         ----------

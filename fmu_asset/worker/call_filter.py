@@ -201,10 +201,11 @@ def _program(calls: _ProcessorCalls, refused_calls: tuple[int, ...], *, tcp: boo
     The kernel runs the program from its first instruction at every system call, until an
     instruction returns "grant", "deny", or "do nothing and report success".
     """
-    # Each `_require` either denies the call or continues with the next instruction, so a sum of
-    # two means "both must hold".
-    # Landlock does not watch other protocols, such as multipath TCP.
-    # Arguments of socket: family (0), type (1), protocol (2).
+    # Each `_require(argument, allowed values)` either denies the call or continues with the next
+    # instruction, so a sum of two means "both must hold".
+
+    # Arguments of socket: family (0), type (1), protocol (2). Other protocols, such as multipath
+    # TCP, are denied, because Landlock does not watch them.
     internet_only = _require(0, (_IPV4, _IPV6)) + _require(2, (0, _TCP, _UDP))
     # Pairs of datagram sockets can send to anybody.
     local_streams_only = _require(0, (_UNIX,)) + _require(1, (_STREAM,), bits=_SOCKET_KIND)

@@ -124,9 +124,10 @@ class RefusalTracer:
             raise OSError(ctypes.get_errno(), os.strerror(ctypes.get_errno()))
 
     def _inspect_call(self, thread: int) -> None:
-        """Record the system call that a thread enters; at its return, count it if it was refused.
+        """Record the system call that a thread enters, or count one that returns if it was refused.
 
-        The arguments are known only at the entry, and the result only at the exit.
+        A thread stops at the entry and at the exit of a call. Its arguments are known only at the
+        entry, and its result only at the exit.
         """
         try:
             self._ptrace(_GET_CALL, thread, len(self._buffer), ctypes.addressof(self._buffer))

@@ -196,9 +196,10 @@ class SeveralSource(FmuSource):
     def _open_session(
         self, binding: Binding, parameters: Mapping[str, float], wiring: "Wiring | None" = None
     ) -> "Session":
-        """Return the coupled FMUs, ready to be started.
+        """Return the coupled FMUs as one asset, ready to be started.
 
-        The system is `wiring` if it is given, and else that of the method `wiring`.
+        The FMUs and their connections are those of the argument `wiring`; without it, those that
+        the method `wiring` returns.
         """
         from fmu_asset.coupling.asset import CoupledAsset
 

@@ -219,7 +219,13 @@ class Clock:
     def _later_step(
         self, time: float, position: float, next_step: int, stream: StreamNotices
     ) -> int:
-        """Return the step of a message that is later than all before it."""
+        """Return the step of a message that is later than all before it.
+
+        `position` is the step that its time suggests, as a number with a fraction. A jump ahead by
+        more than the longest gap begins a new stretch: from there, steps are counted from the
+        message. With `between = "rest"`, a pause begins a new stretch, too, and its steps do not
+        count.
+        """
         is_only_message = self._latest == self._stretches[-1].first_time
         limit = self._section.longest_gap
         if is_only_message:

@@ -93,7 +93,7 @@ def locked_fleet_folder(
 
 
 def fleet_config(folder: Path, *kinds: str) -> JsonObject:
-    """Return the configuration in the folder of a fleet.
+    """Return the content of `config.json` in the folder of a fleet, with the present names of keys.
 
     Parameters
     ----------

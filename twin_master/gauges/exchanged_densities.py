@@ -179,7 +179,11 @@ def binary_digits(exponents: Float) -> Single:
 def exchange_factors(
     observation: StandardizedObservation, model: ModelLikelihood, densities: GaugeDensities
 ) -> ExchangeFactors:
-    """Return the factors of the density ratios that do not depend on the pair."""
+    """Return the factors of the density ratios that are the same at all pairs.
+
+    A pair is a draw with a state. The ratios are those between the densities of gauges and the
+    model's; their formula stands at `ExchangeFactors`.
+    """
     count = len(densities.gauge)
     inverse_model_squares = np.empty(count, np.float32)
     factor = np.empty(count, np.float32)

@@ -212,7 +212,10 @@ class StandardizedObservation(NamedTuple):
 
 @compiled
 def _normal_root(design: Float, weight: Float, root: Float) -> float:
-    """Fill `root` with Cholesky's factor of the normal matrix of a ridge regression.
+    """Return half the log determinant of a ridge regression's normal matrix; fill in its factor.
+
+    The normal matrix is I + D W D^T, with the design D and the weights W on the diagonal. Its
+    factor is that of Cholesky.
 
     Parameters
     ----------
@@ -360,21 +363,31 @@ def standardize(
 
 @compiled
 def number_products(degrees_after: Float, product: Index) -> None:
-    """Fill `product` (G,) with the number of the product of densities of each gauge."""
+    """Fill `product` (G,) with the number of the product that takes each gauge's density.
+
+    The densities of gauges with equal degrees of freedom are multiplied before a power is taken of
+    them, at most `_GAUGES_OF_A_PRODUCT` together. The products are numbered in the order in which
+    their first gauges come.
+
+    Parameters
+    ----------
+    degrees_after : (G,) array
+        The degrees of freedom of each gauge's density.
+    """
     degrees = np.empty(len(product))
-    members = np.zeros(len(product), np.int64)
-    count = 0
+    gauges_in_product = np.zeros(len(product), np.int64)
+    product_count = 0
     for g in range(len(product)):
         number = 0
-        while number < count and (
-            degrees[number] != degrees_after[g] or members[number] == _GAUGES_OF_A_PRODUCT
+        while number < product_count and (
+            degrees[number] != degrees_after[g] or gauges_in_product[number] == _GAUGES_OF_A_PRODUCT
         ):
             number += 1
-        if number == count:
+        if number == product_count:
             degrees[number] = degrees_after[g]
-            count += 1
+            product_count += 1
         product[g] = number
-        members[number] += 1
+        gauges_in_product[number] += 1
 
 
 # ----------------------------------------------------------------------------------------------

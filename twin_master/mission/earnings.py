@@ -50,10 +50,11 @@ FIELDS = ("reward", "health", "beyond_limit", "needless")
 
 
 def earnings(knowledge: Knowledge, control: Index, belief: Float, state: Float) -> Earnings:
-    """Return the earnings of controls in the true state or, where it is unknown, under the belief.
+    """Return what the controls of flights earn in each step; see `Earnings`.
 
-    Between the levels of the state, rewards are interpolated, and the best control is that of the
-    nearest level.
+    Where the true state is known, the earnings are those in this state: rewards are interpolated
+    between the levels of the state, the other values are those of the nearest level. Elsewhere they
+    are expected values under the filtered belief.
 
     Parameters
     ----------
@@ -66,7 +67,8 @@ def earnings(knowledge: Knowledge, control: Index, belief: Float, state: Float) 
     """
     states = knowledge.model.states
     controls = len(knowledge.model.controls)
-    # Columns of each state: the rewards of all controls, then their health rewards.
+    # Each state has 4 U columns, U for each field of `Earnings`: reward and health reward of all
+    # controls, then whether they are beyond the limit, and whether they are needless.
     rewards = np.hstack(
         [knowledge.planning_reward, knowledge.rewards.planning_reward(1.0, 0.0)]
     )  # (S, 2 U)
@@ -83,10 +85,11 @@ def earnings(knowledge: Knowledge, control: Index, belief: Float, state: Float) 
     )
     is_believed = is_flown & ~is_state_known
     earned_by_controls[is_believed] = product_of_each(belief[is_believed], columns_by_state)
-    by_field = earned_by_controls.reshape(*control.shape, 4, controls)
-    in_force = np.maximum(control, 0)[..., None, None]
+    # of all U controls, take the one that was in force
+    earned_by_field = earned_by_controls.reshape(*control.shape, 4, controls)
+    control_in_force = np.maximum(control, 0)[..., None, None]
     reward, health, beyond_limit, needless = np.moveaxis(
-        np.take_along_axis(by_field, in_force, axis=-1).squeeze(axis=-1), -1, 0
+        np.take_along_axis(earned_by_field, control_in_force, axis=-1).squeeze(axis=-1), -1, 0
     )
     return Earnings(reward, health, beyond_limit, needless)
 
@@ -134,12 +137,14 @@ def return_reference(knowledge: Knowledge) -> tuple[Reference, ...]:
     """
     if knowledge.plan.on_belief is None and knowledge.policy is None:
         return ()
-    promised = promised_return(knowledge)
-    low, high = np.quantile(promised.returns, [0.025, 0.975]).tolist()
-    deviation = float(promised.returns.std())
-    mean_text = rounded(promised.mean, deviation)
+    expected_return = promised_return(knowledge)
+    low, high = np.quantile(expected_return.returns, [0.025, 0.975]).tolist()
+    deviation = float(expected_return.returns.std())
+    mean_text = rounded(expected_return.mean, deviation)
     value = f"{mean_text} on average, {between(low, high, deviation)} in 95 %"
-    source = f"{len(promised.returns)} missions under this policy, simulated by the twin's model"
+    source = (
+        f"{len(expected_return.returns)} missions under this policy, simulated by the twin's model"
+    )
     return (Reference(figure="return", value=value, source=source),)
 
 

@@ -234,10 +234,13 @@ def simulate_policy(
 def compare_simple_rules(
     scenario: Scenario, problem: DecisionProblem
 ) -> tuple[ComparedPolicy, ...]:
-    """Return the returns of rules that are simpler than a plan on the belief.
+    """Return the simulated returns of rules that are simpler than a plan on the belief.
 
-    The rules are the most probable control of the policy by states, QMDP, and inspections at fixed
-    intervals. The latter take the first control that inspects, and decide by QMDP in between.
+    - "Mode of the policy by states": the control that the optimal policy of known states takes with
+      the largest probability under the belief.
+    - QMDP: the control with the largest expected value if the state were known after this step.
+    - Inspections at fixed intervals, if there are any: the first control that inspects, and QMDP in
+      between.
     """
     plan = value_iteration(problem.transition, problem.reward, problem.discount)
     decides_on_predicted = scenario.planner.decide_on == "predicted"

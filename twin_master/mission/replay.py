@@ -156,7 +156,10 @@ class _BackwardScan:
         self._later_begin = 0
 
     def read_line(self, line: JournalLine) -> bool:
-        """Evaluate the next line backwards, and return whether earlier lines are needed."""
+        """Evaluate one line of the journal, and return whether earlier lines are needed, too.
+
+        The lines are read backwards, from the last one to the header, which is the first one.
+        """
         is_header = line.begin == 0
         step = -1 if is_header else int(line.record["step"])
         self._check_order(line, step)
@@ -255,7 +258,10 @@ def refilter(
     lag: int | None = None,
     settled: SettledState | None = None,
 ) -> History:
-    """Filter the readings of consecutive steps, each with the model in force, and return the steps.
+    """Return the steps of a mission after its readings are filtered again.
+
+    Each reading is filtered with the model that was in force in its step. The steps are
+    consecutive; filtering ends at the first step without a reading.
 
     Parameters
     ----------
@@ -268,6 +274,7 @@ def refilter(
     settled : SettledState, optional
         The state to begin with; the one before the first step if left out.
     """
+    # begin with the model that is in force at the first step
     models = models_in_force(models)
     first_step = 0 if settled is None else max(settled.step, 0)
     while len(models) > 1 and models[1].from_step <= first_step:

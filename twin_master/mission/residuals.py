@@ -20,7 +20,10 @@ from twin_master.network.inference import known_control
 def expected_in_steps(
     history: History, knowledge: Knowledge, belief: Float, *, is_smoothed: bool
 ) -> Expectation:
-    """Return the expected observations and rewards in the steps of a history.
+    """Return the expected observations and rewards in the steps of a history, given a belief.
+
+    The sensor model is averaged over the draws of the calibrated parameter or, if the twin has
+    learnt during the flight, over what it had learnt in each step (`carried`).
 
     Parameters
     ----------

@@ -277,9 +277,11 @@ class UpperBound:
         return is_fast and compositions * _MOST_PARTS <= _MOST_KEPT_PARTS
 
     def settle(self) -> None:
-        """Improve the bound at all beliefs by sweeps of value iteration with fixed compositions.
+        """Improve the bound at all beliefs by sweeps of value iteration.
 
-        If that takes too much time or memory (`can_settle`), the bound is not changed.
+        The bound at a belief that may follow is a weighted sum of the bounds at known beliefs, its
+        composition. The compositions are found anew in each pass, and stay fixed in its sweeps. If
+        all that takes too much time or memory (`can_settle`), the bound is not changed.
         """
         if not self.can_settle():
             return
@@ -310,7 +312,9 @@ class UpperBound:
                 self._update_drop()
 
     def _compose_next_rows(self, corner_states: Index) -> _NextRows:
-        """Compose every belief that can follow any of the J beliefs, under any control.
+        """Return the composition of every belief that can follow any of the J beliefs.
+
+        All controls and observations are considered.
 
         Parameters
         ----------

@@ -62,7 +62,7 @@ def belief_figure(run: Run) -> Figure:
 
 
 def _joint_figure(run: Run) -> Figure:
-    """Draw the joint belief of two factors in a few steps."""
+    """Draw the joint belief of two factors in a few steps, with one map for each step."""
     steps = belief_steps(run)
     columns = min(4, len(steps))
     rows = -(-len(steps) // columns)  # rounded up
@@ -80,6 +80,7 @@ def _joint_figure(run: Run) -> Figure:
     )
     for axes, step in zip(style.keep_first_panels(grid, len(steps)), steps, strict=True):
         image = _draw_joint_belief(axes, run, step)
+    # one colour bar at the right of all panels: position and size as fractions of the figure
     height = figure.get_figheight()
     bar_axes = figure.add_axes((right_edge + 0.015, 0.43 / height, 0.013, 1 - 0.95 / height))
     style.color_bar(figure, image, "probability", cax=bar_axes)
@@ -88,9 +89,9 @@ def _joint_figure(run: Run) -> Figure:
 
 
 def _draw_joint_belief(axes: Axes, run: Run, step: int) -> QuadMesh:
-    """Draw the joint belief of two factors in the step of a row, its mean and the true state.
+    """Draw the joint belief of two factors after one step, its mean and the true state.
 
-    Return the map, for its colour bar.
+    `step` counts from the first step of the run. Return the map, for its colour bar.
     """
     image = _draw_state_map(axes, run, run["filtered/probability"][step], **_PROBABILITY_COLORS)
     axes.set_title(f"{run.step_word} {run.first_step + step}", fontweight="normal", pad=3.0)

@@ -205,8 +205,8 @@ class Teaching:
 
         It is due if the alarm came at least `SETTLE_STEPS` steps ago, its evidence still exceeds
         the threshold, and neither another search nor the trial of a patch is running. `suspicion`
-        has the log evidence [nats] of two hypotheses: no state of the model explains the readings;
-        a single gauge is off.
+        has the log evidence [nats] of two hypotheses: that no state of the model explains the
+        readings, and that one gauge alone is wrong.
         """
         is_busy = self.steps_to_search is not None or self.verdict_on_trial is not None
         if self._current_alarm is None or is_busy or self.step < self._next_search_step:

@@ -81,7 +81,11 @@ class PartDraft:
 
 
 def draft_part(mesh: StructureMesh) -> PartDraft:
-    """Choose support, regions and gauges of a part by its extent alone."""
+    """Return a support, a loaded tip, regions and gauges for a part, by its extent alone.
+
+    The part is taken to be supported at the low end of its longest axis, the root, and loaded at
+    the other end, the tip.
+    """
     points = mesh.points / mesh.unit
     low = points.min(axis=0)
     high = points.max(axis=0)
@@ -277,7 +281,7 @@ def drafted_part(name: str, mesh_file: Path | None) -> _DraftedPart:
 def mesh_project(name: str, mesh_file: Path | None) -> Project:
     """Return a project with a part drafted from a mesh file, and a mission of its twin.
 
-    Without a mesh file it is that of the shipped bracket.
+    Without a mesh file, the part is the bracket that the program ships with.
     """
     part = drafted_part(name, mesh_file)
     mesh_name = part.mesh_file.name

@@ -136,7 +136,10 @@ def rig_project(name: str, ring_down: Path | None) -> Project:
 
 
 def _with_comments(campaign: str) -> str:
-    """Return the text of a campaign with a schema line, and a comment at each key's first place."""
+    """Return the text of a campaign file with a schema line and comments.
+
+    A comment tells the meaning of a key where it first occurs in a table.
+    """
     lines = [
         schema_line("campaign").rstrip("\n"),
         "# What was measured, and how. Further records stand beside this file, each a [[trial]].",

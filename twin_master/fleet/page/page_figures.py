@@ -139,6 +139,7 @@ def returns_figure(returns: Mapping[str, Float]) -> Figure:
     axes.use_sticky_edges = False  # else the leftmost band would end at the axis
     for row, values in enumerate(groups.values()):
         low, lower_quartile, upper_quartile, high = np.quantile(values, [0.05, 0.25, 0.75, 0.95])
+        # both bands are transparent: where they overlap, the central half of the flights is darker
         for begin, end in ((low, high), (lower_quartile, upper_quartile)):
             axes.barh(row, end - begin, left=begin, height=0.6, color=style.PRESENT, alpha=0.2)
         mean = float(values.mean())
@@ -149,6 +150,7 @@ def returns_figure(returns: Mapping[str, Float]) -> Figure:
     axes.set_xlabel("return: rewards of a flight, discounted")
     axes.grid(axis="x")
     axes.xaxis.set_major_locator(MaxNLocator(5))
+    # widen the axis if it is so narrow that its numbers would hardly differ
     low, high = axes.get_xlim()
     middle = 0.5 * (low + high)
     half_width = max(0.5 * (high - low), _LEAST_WIDTH * abs(middle))

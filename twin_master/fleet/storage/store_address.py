@@ -44,7 +44,7 @@ class StoreAddress:
         return RemoteStore(FsspecStore.from_url(self.remote), self.explained_errors)
 
     def check(self) -> None:
-        """Check that the address is of a kind for which a package is installed.
+        """Check that the address has the right form, and that the packages for it are installed.
 
         Raises
         ------

@@ -254,7 +254,7 @@ class FleetWatch:
         return steps
 
     def _take_up(self, group: Group, name: str, feed: Feed) -> None:
-        """Begin or resume the watch of an asset, and pass on a decision that was not passed on.
+        """Begin or resume the watch of an asset, and hand on its last decision if that is due.
 
         An error is raised if the name cannot be that of a folder, or if there are too many assets.
         """
