@@ -11,7 +11,7 @@ from typing import Literal
 
 import numpy as np
 
-from discrepancy.campaign.records import FloatArray
+from discrepancy.campaign.records import FloatArray, TrialKind
 from discrepancy.catalogue.effect_in_setting import DYNAMIC
 from discrepancy.catalogue.entry import (
     NINETY_PERCENT_QUANTILE,
@@ -156,7 +156,7 @@ def force_curve(
         equation=f"F = F({variable}), a curve through estimated points",
         signature=f"The missing force is a function of the {variable}.",
         reference="Rasmussen and Williams 2006, Gaussian Processes for Machine Learning, chapter 2",
-        acts_on=DYNAMIC,
+        acts_on=frozenset(TrialKind) if variable == "displacement" else DYNAMIC,
         parameters=tuple(parameters),
         build=build,
         places=lambda setting: (port,),

@@ -1,13 +1,13 @@
 """A hypothesis at its most probable values: effects, motion, missing forces and evidence."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 
 from discrepancy.campaign.records import FloatArray
 from discrepancy.fits.candidate import Candidate
-from discrepancy.trials_in_motion.trial import PortedTrial
+from discrepancy.trials_in_motion.trial_at_rest import LinearTrial
 
 from .filtered import SmoothedTrial
 from .linearisation import Linearisation
@@ -73,9 +73,21 @@ class Estimate:
     follows_laws: bool = False
 
     @property
-    def ported_trials(self) -> tuple[PortedTrial, ...]:
-        """The trials as linear systems with ports, in which the estimate was made."""
+    def ported_trials(self) -> tuple[LinearTrial, ...]:
+        """The linear trials with ports, in which the estimate was made."""
         return tuple(smoothed_trial.trial for smoothed_trial in self.trials)
+
+    @property
+    def in_motion(self) -> "Estimate":
+        """The estimate with its trials in motion alone."""
+        linear_trials = self.linearisation.in_motion
+        if len(linear_trials) == len(self.trials):
+            return self
+        return replace(
+            self,
+            trials=tuple(trial for trial in self.trials if not trial.trial.is_at_rest),
+            linearisation=replace(self.linearisation, trials=linear_trials),
+        )
 
     @property
     def local(self) -> tuple[FloatArray, ...]:

@@ -9,7 +9,7 @@ laws alone give. The estimate with the largest evidence is returned.
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import product
-from math import inf
+from math import inf, sqrt
 
 from .estimate import Estimate
 from .force_states import Process
@@ -92,13 +92,23 @@ class MotionEstimator:
         return scale_processes(self.processes_without_effects, SMALL_FRACTION, 1.0)
 
     def missing_force_ratio(self, estimate: Estimate) -> float:
-        """Return the standard deviation of the missing force over that without effects.
+        """Return the missing forces over those without effects, all ports together.
 
-        It is the largest ratio of all ports.
+        Forces at different ports are divided by their prior medians, and their variances added: at
+        a port where nothing is missing, the ratio of two small forces says nothing.
         """
-        return max(
-            process.standard_deviation / self.processes_without_effects[port].standard_deviation
-            for port, process in estimate.processes.items()
+        return self._size_of_forces(estimate.processes) / self._size_of_forces(
+            self.processes_without_effects
+        )
+
+    def _size_of_forces(self, processes: Processes) -> float:
+        """Return the root of the sum of squares of forces, each over its prior median."""
+        medians = self.gauss_newton.prior_medians
+        return sqrt(
+            sum(
+                (process.standard_deviation / medians[port].standard_deviation) ** 2
+                for port, process in processes.items()
+            )
         )
 
     def estimate_from_far(self, laws: HypothesisLaws, start: EstimatorStart) -> Estimate | None:

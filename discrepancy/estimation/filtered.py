@@ -9,7 +9,7 @@ import numpy as np
 from discrepancy.campaign.records import FloatArray
 from discrepancy.trials_in_motion.steps import discretise, respond_to_inputs
 from discrepancy.trials_in_motion.trajectory import Trajectory
-from discrepancy.trials_in_motion.trial import PortedTrial
+from discrepancy.trials_in_motion.trial_at_rest import LinearTrial
 
 from .force_states import ForceStates
 from .kernel import filter_record, smooth_record, substep_matrices_with_laws
@@ -273,8 +273,8 @@ class SmoothedTrial:
 
     Attributes
     ----------
-    trial : PortedTrial
-        The trial as a linear system with ports.
+    trial : PortedTrial or TrialAtRest
+        The linear trial with ports.
     trajectory : Trajectory
         The smoothed motion, and all forces at ports.
     missing_forces : mapping of int to (F,) ndarray
@@ -290,7 +290,7 @@ class SmoothedTrial:
         The unknowns of this trial alone.
     """
 
-    trial: PortedTrial
+    trial: LinearTrial
     trajectory: Trajectory
     missing_forces: Mapping[int, FloatArray]
     missing_force_deviations: Mapping[int, FloatArray]
@@ -308,16 +308,4 @@ class SmoothedTrial:
     @cached_property
     def explained_trajectory(self) -> Trajectory:
         """The trajectory minus what the missing forces, which no law explains, add to it."""
-        trajectory = self.trajectory
-        missing_state = np.zeros_like(trajectory.added_state)
-        forces = dict(trajectory.forces)
-        for port, force in self.missing_forces.items():
-            missing_state += self.trial.state_under_force(port, force)
-            forces[port] = forces[port] - force
-        system = self.trial.system
-        return Trajectory(
-            added_state=trajectory.added_state - missing_state,
-            positions=trajectory.positions - missing_state @ system.positions.T,
-            speeds=trajectory.speeds - missing_state @ system.speeds.T,
-            forces=forces,
-        )
+        return self.trial.trajectory_without(self.trajectory, self.missing_forces)

@@ -15,7 +15,7 @@ from discrepancy.campaign.records import FloatArray
 from discrepancy.fits.candidate import Candidate, Point
 from discrepancy.fits.problem import Problem
 from discrepancy.trials_in_motion.effects import EffectLaws
-from discrepancy.trials_in_motion.trial import PortedTrial
+from discrepancy.trials_in_motion.trial_at_rest import LinearTrial
 
 from .estimate import NO_EFFECTS, Estimate, estimate_of_processes
 from .estimator import LARGEST_RATIO_BESIDE_LAWS, USUAL_WINDOW, MotionEstimator
@@ -79,10 +79,7 @@ class ForceSearch:
 
     def _in_thinned_records(self) -> "ForceSearch | None":
         """Return the search in thinned records; None if they are short or cannot be thinned."""
-        sample_count = sum(
-            len(self.ported.problem.trials[k].trial.time) for k in self.ported.trial_indices
-        )
-        if sample_count < THINNED_AT_LEAST * MOST_THINNED_SAMPLES:
+        if self.ported.trial_set.sample_count < THINNED_AT_LEAST * MOST_THINNED_SAMPLES:
             return None
         thinned = ForceSearch(self.ported.problem_with_laws, MOST_THINNED_SAMPLES)
         is_thinned = any(trial.trial.stride > 1 for trial in thinned.best_port_estimate.trials)
@@ -207,7 +204,7 @@ class ForceSearch:
 
     def _estimate_along_motion(
         self,
-        trials: tuple[PortedTrial, ...],
+        trials: tuple[LinearTrial, ...],
         first_processes: Processes,
         prior_medians: dict[int, Process],
         *,
@@ -258,7 +255,7 @@ class ForceSearch:
         prior = log_prior(estimate.candidate, effect_count, self.ported.problem.setting)
         return estimate.log_evidence + prior
 
-    def estimator(self, trials: Sequence[PortedTrial]) -> MotionEstimator:
+    def estimator(self, trials: Sequence[LinearTrial]) -> MotionEstimator:
         """Return the estimator of hypotheses in some trials."""
         processes = self.estimate_without_effects.processes
         prior_medians = self.ported.prior_processes(processes)
@@ -352,7 +349,7 @@ class ForceSearch:
             start_in_other_trials(self.estimate_without_effects, trials),
             effect=point.effect,
             shared=point.shared,
-            local=tuple(point.local[number] for number in self.ported.trial_indices),
+            local=point.local,
             processes=estimator.small_processes,
         )
         return estimator.follow_laws(self.ported.laws(candidate, trials), start)

@@ -23,11 +23,11 @@ from discrepancy.trials_in_motion.trajectory import (
     LinearisedSensorErrors,
     Trajectory,
 )
-from discrepancy.trials_in_motion.trial import PortedTrial
+from discrepancy.trials_in_motion.trial_at_rest import LinearTrial
 
 from .estimate import Estimate
-from .linearisation import Linearisation
-from .linearised import LinearisedTrial, Simulation
+from .linearisation import Linearisation, linearised
+from .linearised import Simulation
 from .process_search import Processes, prior_log_density
 from .regression import Priors
 
@@ -171,7 +171,7 @@ def start_from_estimate(estimate: Estimate) -> EstimatorStart:
 
 def linearise_trials(
     laws: HypothesisLaws,
-    trials: Sequence[PortedTrial],
+    trials: Sequence[LinearTrial],
     start: EstimatorStart,
     speed_window: float,
     shared_priors: Priors,
@@ -198,9 +198,9 @@ def linearise_trials(
         if forces_and_sensor_errors is None:
             return None
         forces, sensor_errors = forces_and_sensor_errors
-        linear_trial = LinearisedTrial(
-            trial=trial,
-            trajectory=start.trajectories[trial_index],
+        linear_trial = linearised(
+            trial,
+            start.trajectories[trial_index],
             forces=forces,
             sensor_errors=sensor_errors,
             effect=start.effect,
@@ -214,7 +214,7 @@ def linearise_trials(
 
 def linearise_along_laws(
     laws: HypothesisLaws,
-    trials: Sequence[PortedTrial],
+    trials: Sequence[LinearTrial],
     start: EstimatorStart,
     speed_window: float,
     shared_priors: Priors,
@@ -307,7 +307,7 @@ class GaussNewton:
 
     Attributes
     ----------
-    trials : tuple of PortedTrial
+    trials : tuple of LinearTrial
         The dynamic trials as linear systems with ports.
     shared_priors : Priors
         The priors of the K shared unknowns.
@@ -315,7 +315,7 @@ class GaussNewton:
         The prior medians of the missing forces, by the number of the port.
     """
 
-    trials: tuple[PortedTrial, ...]
+    trials: tuple[LinearTrial, ...]
     shared_priors: Priors
     prior_medians: Processes
 

@@ -1,18 +1,25 @@
 """All trials of a hypothesis, linear along their trajectories, as one linear regression."""
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 
 from discrepancy.campaign.records import FloatArray
-from discrepancy.trials_in_motion.trajectory import NO_SENSOR_ERRORS, Trajectory
-from discrepancy.trials_in_motion.trial import PortedTrial, correlation_time_range
+from discrepancy.trials_in_motion.trajectory import (
+    NO_SENSOR_ERRORS,
+    LinearisedForce,
+    LinearisedSensorErrors,
+    Trajectory,
+)
+from discrepancy.trials_in_motion.trial import correlation_time_range
+from discrepancy.trials_in_motion.trial_at_rest import LinearTrial, TrialAtRest
 
 from .filtered import FilteredTrial, SmoothedTrial
 from .force_states import Process
 from .linearised import LinearisedTrial
+from .linearised_rest import LinearisedRest, RestUnderForces
 from .process_search import MOST_STEPS, Processes, ProcessSearch, prior_log_density
 from .regression import LEAST_PRECISION, Priors, Regression, Solution, integrate_out_last
 
@@ -23,13 +30,13 @@ class Linearisation:
 
     Attributes
     ----------
-    trials : tuple of LinearisedTrial
-        The trials, each linear about the same values.
+    trials : tuple of LinearisedTrial or LinearisedRest
+        The trials in motion and at rest, each linear about the same values.
     priors : Priors
         The priors of the K unknowns that all trials share, then of the E of the effects.
     """
 
-    trials: tuple[LinearisedTrial, ...]
+    trials: tuple[LinearisedTrial | LinearisedRest, ...]
     priors: Priors
 
     @property
@@ -40,16 +47,25 @@ class Linearisation:
     @cached_property
     def correlation_time_range(self) -> tuple[float, float]:
         """The bounds of a correlation time [s]: shortest sampling interval, longest record."""
-        return correlation_time_range([linear_trial.trial for linear_trial in self.trials])
+        return correlation_time_range([linear_trial.trial for linear_trial in self.in_motion])
 
-    def filter(self, processes: Processes) -> Iterator[FilteredTrial]:
+    @property
+    def in_motion(self) -> tuple[LinearisedTrial, ...]:
+        """The trials in motion."""
+        return tuple(trial for trial in self.trials if isinstance(trial, LinearisedTrial))
+
+    def filter(self, processes: Processes) -> Iterator[FilteredTrial | RestUnderForces]:
         """Yield the filter of each trial with missing forces, one after the other.
 
         A filter needs tens of MB in a long record, which are free again with the next trial.
         """
-        return (FilteredTrial(linear_trial, processes) for linear_trial in self.trials)
+        for linear_trial in self.trials:
+            if isinstance(linear_trial, LinearisedTrial):
+                yield FilteredTrial(linear_trial, processes)
+            else:
+                yield RestUnderForces(linear_trial, processes)
 
-    def regression(self, filtered_trials: Iterable[FilteredTrial]) -> Regression:
+    def regression(self, filtered_trials: Iterable[FilteredTrial | RestUnderForces]) -> Regression:
         """Return the normal equations of all unknowns but the local ones.
 
         The local unknowns, which occur in one trial only, are integrated out.
@@ -71,7 +87,9 @@ class Linearisation:
         """Return log evidence and values of the K + E unknowns, given the missing forces."""
         return self._solve_filtered(self.filter(processes))
 
-    def _solve_filtered(self, filtered_trials: Iterable[FilteredTrial]) -> Solution:
+    def _solve_filtered(
+        self, filtered_trials: Iterable[FilteredTrial | RestUnderForces]
+    ) -> Solution:
         """Return log evidence and values of the K + E unknowns by the filters of all trials."""
         return self.regression(filtered_trials).solve(range(len(self.priors)), self.priors)
 
@@ -139,7 +157,7 @@ class Linearisation:
 
 
 def _most_probable_local_unknowns(
-    filtered_trial: FilteredTrial, shared_and_effect: FloatArray
+    filtered_trial: FilteredTrial | RestUnderForces, shared_and_effect: FloatArray
 ) -> FloatArray:
     """Return the most probable values (L,) of the local unknowns of one trial.
 
@@ -158,7 +176,7 @@ def _most_probable_local_unknowns(
 
 
 def _smooth_filtered(
-    filtered_trials: Iterable[FilteredTrial], solution: Solution
+    filtered_trials: Iterable[FilteredTrial | RestUnderForces], solution: Solution
 ) -> tuple[SmoothedTrial, ...]:
     """Return the smoothed motion of filtered trials at the shared values of a solution."""
     smoothed_trials = []
@@ -169,22 +187,30 @@ def _smooth_filtered(
     return tuple(smoothed_trials)
 
 
-def trajectory_of_model(trial: PortedTrial) -> Trajectory:
-    """Return the motion of a trial by the linear model alone, to which no force adds anything."""
-    no_state = np.zeros((len(trial.fine_time), len(trial.system.generator)))
-    return Trajectory(no_state, trial.port_positions, trial.port_speeds, {})
+def linearised(
+    trial: LinearTrial,
+    trajectory: Trajectory,
+    forces: Mapping[int, LinearisedForce],
+    sensor_errors: LinearisedSensorErrors,
+    effect: FloatArray,
+    shared: FloatArray,
+) -> LinearisedTrial | LinearisedRest:
+    """Return a trial with laws that are linear about a trajectory and values of the unknowns."""
+    if isinstance(trial, TrialAtRest):
+        return LinearisedRest(trial, trajectory, forces, sensor_errors, effect, shared)
+    return LinearisedTrial(trial, trajectory, forces, sensor_errors, effect, shared)
 
 
-def plain_linearisation(trials: Sequence[PortedTrial], shared_priors: Priors) -> Linearisation:
+def plain_linearisation(trials: Sequence[LinearTrial], shared_priors: Priors) -> Linearisation:
     """Return trials along the motion of the linear model, without any law or error of a sensor."""
     no_effect = np.zeros(0)
     linear_trials = []
     for trial in trials:
         shared = trial.linearisation_point[: len(shared_priors)]
         linear_trials.append(
-            LinearisedTrial(
-                trial=trial,
-                trajectory=trajectory_of_model(trial),
+            linearised(
+                trial,
+                trial.trajectory_of_model(),
                 forces={},
                 sensor_errors=NO_SENSOR_ERRORS,
                 effect=no_effect,

@@ -1,4 +1,4 @@
-"""A problem whose trials in motion are linear systems with the ports of its model.
+"""A problem whose trials are linear, in motion and at rest, but for laws at the model's ports.
 
 The model's own laws are left out of them: their forces act at the ports, as missing forces and laws
 of effects do.
@@ -13,7 +13,7 @@ from discrepancy.fits.candidate import PARAMETER_STEP, Candidate, Point, with_st
 from discrepancy.fits.problem import Problem
 from discrepancy.trials_in_motion.effects import HALF_DIFFERENCE, EffectLaws
 from discrepancy.trials_in_motion.trajectory import Trajectory
-from discrepancy.trials_in_motion.trial import PortedTrial
+from discrepancy.trials_in_motion.trial_at_rest import LinearTrial
 from fe.runtime.laws.interface import PortForce
 from fe.runtime.patch import ModelPatch
 
@@ -59,10 +59,8 @@ class PortedProblem:
         The model's own laws at its ports, which its linear system does not contain.
     prior_means : Point
         The prior means of all unknowns, about which the trials are linear at first.
-    trial_indices : list of int
-        The indices of the trials in motion in the problem.
     trial_set : TrialSet
-        The trials in motion, from which linear systems are made.
+        The trials, from which linear trials with ports are made.
     shared_priors : Priors
         The priors of the unknowns that all trials share.
     """
@@ -73,12 +71,11 @@ class PortedProblem:
         trials = tuple(data.trial for data in problem.trials)
         self.model = problem.model
         self.problem = problem.with_trials(trials, linear_model)
-        self.trial_indices = [k for k, data in enumerate(problem.trials) if data.trial.is_dynamic]
         self.ports = tuple(linear_model.ports)
         self.prior_means = self.problem.prior_mean_point(NO_EFFECTS)
         self.trial_set = TrialSet(
             problem=self.problem,
-            trial_indices=self.trial_indices,
+            trial_indices=range(len(problem.trials)),
             evaluate_model_laws=self.evaluate_model_laws,
             unknowns_of_model_laws=self._unknowns_of_model_laws(self.prior_means.shared),
             sample_limit=sample_limit,
@@ -92,12 +89,11 @@ class PortedProblem:
 
         Free forces at more ports than that fit any reading, whatever law acts at one of them.
         """
-        trials = [self.problem.trials[number] for number in self.trial_indices]
-        return all(len(data.trial.channels) >= len(self.ports) for data in trials)
+        return all(len(data.trial.channels) >= len(self.ports) for data in self.problem.trials)
 
     def linearise(
         self,
-        trials: tuple[PortedTrial, ...],
+        trials: tuple[LinearTrial, ...],
         trajectories: tuple[Trajectory, ...],
         shared_values: FloatArray,
     ) -> Linearisation:
@@ -151,7 +147,7 @@ class PortedProblem:
             != laws_at_point
         )
 
-    def laws(self, candidate: Candidate, trials: Sequence[PortedTrial]) -> EffectLaws:
+    def laws(self, candidate: Candidate, trials: Sequence[LinearTrial]) -> EffectLaws:
         """Return the laws and sensor errors of a hypothesis in some of the trials."""
         return self.trial_set.laws(candidate, trials)
 
@@ -167,16 +163,13 @@ class PortedProblem:
         shared_values : (K,) array
             The scaled values of the K unknowns that all trials share.
         local_of_trials : iterable of (L,) array
-            The unknowns of each trial in motion.
+            The unknowns of each trial alone.
         """
-        local_values = [np.zeros(data.unknowns.unknown_count) for data in self.problem.trials]
-        for number, values in zip(self.trial_indices, local_of_trials, strict=True):
-            local_values[number] = values
         low, high = self.problem.shared.bounds
         # a margin of one step, so that difference quotients stay in the ranges
         low = np.maximum(low + PARAMETER_STEP, -2.0)
         high = np.minimum(high - PARAMETER_STEP, 2.0)
-        return Point(np.clip(shared_values, low, high), tuple(local_values), np.zeros(0))
+        return Point(np.clip(shared_values, low, high), tuple(local_of_trials), np.zeros(0))
 
     def point_of(self, estimate: Estimate) -> Point:
         """Return `point_of_unknowns` of an estimate, without its effects."""

@@ -33,6 +33,7 @@ from .filtered import SmoothedTrial
 from .force_search import ForceSearch
 from .linearisation import Linearisation
 from .linearised import LinearisedTrial
+from .linearised_rest import LinearisedRest
 from .ported_problem import WIDE_WINDOW
 from .process_search import Processes, processes_within_range, scale_processes
 from .regression import Priors
@@ -355,11 +356,11 @@ def _with_columns(base: Estimate, tried_effects: Sequence[TriedEffect]) -> Linea
 
 
 def _trial_with_columns(
-    linear_trial: LinearisedTrial,
+    linear_trial: LinearisedTrial | LinearisedRest,
     columns: Sequence[EffectColumn],
     first_factor: int,
     effect: FloatArray,
-) -> LinearisedTrial:
+) -> LinearisedTrial | LinearisedRest:
     """Return a linear trial with the columns of effects, whose factors are further unknowns.
 
     `first_factor` is the number of the first factor among the unknowns. `effect` are the effect

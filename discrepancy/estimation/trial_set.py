@@ -15,7 +15,7 @@ from discrepancy.fits.problem import Problem
 from discrepancy.trials_in_motion.effects import EffectLaws
 from discrepancy.trials_in_motion.ported_trial import ported_trial, thin_trial
 from discrepancy.trials_in_motion.trajectory import Trajectory
-from discrepancy.trials_in_motion.trial import PortedTrial
+from discrepancy.trials_in_motion.trial_at_rest import LinearTrial, TrialAtRest, trial_at_rest
 from fe.runtime.patch import ModelPatch
 
 from .estimate import Estimate
@@ -50,18 +50,25 @@ class TrialSet:
         """Return all samples of other trials, with the same model."""
         return replace(self, problem=problem, trial_indices=trial_indices, sample_limit=None)
 
-    def trials_about(self, point: Point) -> tuple[PortedTrial, ...]:
-        """Return the trials as systems with ports, linear about values of the unknowns."""
-        sample_counts = [len(self.problem.trials[k].trial.time) for k in self.trial_indices]
+    @property
+    def sample_count(self) -> int:
+        """The number of samples of all trials in motion together."""
+        trials = [self.problem.trials[number].trial for number in self.trial_indices]
+        return sum(len(trial.time) for trial in trials if trial.is_dynamic)
+
+    def trials_about(self, point: Point) -> tuple[LinearTrial, ...]:
+        """Return the trials with ports, linear about values of the unknowns."""
         wanted_stride = 1.0
         if self.sample_limit is not None:
-            wanted_stride = sum(sample_counts) / self.sample_limit
+            wanted_stride = self.sample_count / self.sample_limit
         return tuple(
             thin_trial(ported_trial(self.problem, number, point), wanted_stride)
+            if self.problem.trials[number].trial.is_dynamic
+            else trial_at_rest(self.problem, number, point)
             for number in self.trial_indices
         )
 
-    def laws(self, candidate: Candidate, trials: Sequence[PortedTrial]) -> EffectLaws:
+    def laws(self, candidate: Candidate, trials: Sequence[LinearTrial]) -> EffectLaws:
         """Return the laws and sensor errors of a hypothesis in these trials."""
         return EffectLaws(
             problem=self.problem,
@@ -74,7 +81,7 @@ class TrialSet:
 
 
 def start_in_other_trials(
-    estimate: Estimate, other_trials: Sequence[PortedTrial]
+    estimate: Estimate, other_trials: Sequence[LinearTrial]
 ) -> EstimatorStart:
     """Return the start of an estimate in trials that are linear about other unknowns.
 
@@ -85,8 +92,11 @@ def start_in_other_trials(
     trajectories = []
     for smoothed_trial, other_trial in zip(estimate.trials, other_trials, strict=True):
         unknowns = np.concatenate((estimate.shared, smoothed_trial.local))
-        trajectory = smoothed_trial.trajectory
-        motion = smoothed_trial.trial.port_motion(unknowns, trajectory.added_state)
+        trial, trajectory = smoothed_trial.trial, smoothed_trial.trajectory
+        if isinstance(trial, TrialAtRest) or isinstance(other_trial, TrialAtRest):
+            trajectories.append(trajectory)
+            continue
+        motion = trial.port_motion(unknowns, trajectory.added_state)
         other_motion = other_trial.port_motion(unknowns, trajectory.added_state)
         motion_difference = np.concatenate(motion, axis=1) - np.concatenate(other_motion, axis=1)
         motion_by_state = np.concatenate((other_trial.system.positions, other_trial.system.speeds))
@@ -96,7 +106,7 @@ def start_in_other_trials(
 
 
 def trajectory_in_all_samples(
-    thinned_trial: PortedTrial, trial: PortedTrial, trajectory: Trajectory, unknowns: FloatArray
+    thinned_trial: LinearTrial, trial: LinearTrial, trajectory: Trajectory, unknowns: FloatArray
 ) -> Trajectory:
     """Return the motion of a thinned trial at all fine stamps of the record.
 
@@ -105,13 +115,15 @@ def trajectory_in_all_samples(
 
     Parameters
     ----------
-    thinned_trial, trial : PortedTrial
+    thinned_trial, trial : LinearTrial
         The trial with some of its samples, and with all of them.
     trajectory : Trajectory
         The motion of the thinned trial.
     unknowns : (K + L,) array
         The values of the shared unknowns, then of those of the trial alone.
     """
+    if isinstance(trial, TrialAtRest):
+        return trajectory  # a trial at rest is not thinned
     time, thinned_time = trial.fine_time, thinned_trial.fine_time
     added_state = np.column_stack(
         [np.interp(time, thinned_time, state) for state in trajectory.added_state.T]

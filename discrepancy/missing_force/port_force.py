@@ -289,7 +289,7 @@ def _forces_by_trial(
     port, and `recorded` has the trials as they were recorded, by name.
     """
     trial_forces = []
-    for smoothed_trial in estimate.trials:
+    for smoothed_trial in estimate.in_motion.trials:
         trial = smoothed_trial.trial
         samples = slice(None, None, trial.substeps)
         law_force = smoothed_trial.effect_forces[port][samples] if has_law else None

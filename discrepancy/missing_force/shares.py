@@ -9,7 +9,7 @@ import numpy as np
 
 from discrepancy.campaign.records import FloatArray
 from discrepancy.estimation.estimate import NO_EFFECTS, Estimate
-from discrepancy.estimation.filtered import SmoothedTrial
+from discrepancy.estimation.filtered import FilteredTrial, SmoothedTrial
 from discrepancy.estimation.force_search import ForceSearch
 from discrepancy.estimation.gauss_newton import (
     EstimatorStart,
@@ -22,6 +22,7 @@ from discrepancy.estimation.process_search import Processes
 from discrepancy.estimation.trial_set import TrialSet
 from discrepancy.fits.candidate import Point
 from discrepancy.trials_in_motion.trial import PortedTrial
+from discrepancy.trials_in_motion.trial_at_rest import LinearTrial
 
 from .gap_share import OF_FORCE, OF_PREDICTIONS, SEED, GapShare
 
@@ -65,7 +66,7 @@ class ForceShares:
         campaign = search.ported.problem.campaign
         held_out = tuple(trial for trial in campaign.held_out if trial.is_dynamic)
         self._held_out: TrialSet | None = None
-        self._held_out_trials: dict[bytes, tuple[PortedTrial, ...]] = {}
+        self._held_out_trials: dict[bytes, tuple[LinearTrial, ...]] = {}
         self._without_effect: dict[bool, tuple[SmoothedTrial, ...]] = {}
         if held_out:
             problem = search.ported.problem.with_trials(held_out)
@@ -150,7 +151,7 @@ class ForceShares:
             The sums of each block of all trials: of weighted forces, and of changes of readings
             divided by their noise.
         """
-        system = trials[0].trial.system
+        system = linearisation.in_motion[0].trial.system
         weights = {}
         for port in trials[0].missing_forces:
             strength_on_state = np.linalg.norm(system.actions[port])
@@ -158,11 +159,12 @@ class ForceShares:
             weights[port] = float(np.hypot(strength_on_state, strength_on_readings))
         of_forces = []
         of_predictions = []
-        filters = linearisation.filter(self._large_processes(estimate))
-        for smoothed_trial, without_effect, filtered_trial in zip(
-            trials, trials_without, filters, strict=True
+        processes = self._large_processes(estimate)
+        for smoothed_trial, without_effect, linear_trial in zip(
+            trials, trials_without, linearisation.in_motion, strict=True
         ):
-            trial = smoothed_trial.trial
+            trial = linear_trial.trial
+            filtered_trial = FilteredTrial(linear_trial, processes)
             # missing forces as they would be estimated from noise alone
             noise_states, _ = filtered_trial.smooth_residual(_simulated_noise(trial))
             noise_forces = filtered_trial.missing_forces(noise_states)
@@ -221,9 +223,8 @@ class ForceShares:
         """
         processes = self._large_processes(estimate)
         if not held_out:
-            return estimate.linearisation, estimate.linearisation.smooth(
-                processes, estimate.solution
-            )
+            in_motion = estimate.in_motion.linearisation
+            return in_motion, in_motion.smooth(processes, estimate.solution)
         assert self._held_out is not None
         priors = self.search.ported.shared_priors
         trials = self._held_out_linearised_as(estimate)
@@ -255,7 +256,7 @@ class ForceShares:
             smoothed_trials = linearisation.smooth(remaining_processes, estimate.solution)
         return linearisation, linearisation.smooth(processes, estimate.solution)
 
-    def _held_out_linearised_as(self, estimate: Estimate) -> tuple[PortedTrial, ...]:
+    def _held_out_linearised_as(self, estimate: Estimate) -> tuple[LinearTrial, ...]:
         """Return the held-out trials, linearised about the same values as the fitted trials."""
         assert self._held_out is not None
         problem = self._held_out.problem

@@ -83,11 +83,11 @@ class EventTrials:
                 time=linear_trial.trial.time[::stride],
                 used=linear_trial.trial.used[::stride],
             )
-            for linear_trial in linearisation.trials
+            for linear_trial in linearisation.in_motion
         ]
         # the columns of unknowns are minus the derivatives: change their sign
         self.columns = []
-        for linear_trial in linearisation.trials:
+        for linear_trial in linearisation.in_motion:
             signs = np.r_[1.0, -np.ones(linear_trial.weight_count - 1)]
             self.columns.append(linear_trial.columns[::stride] * signs)
 

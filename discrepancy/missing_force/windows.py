@@ -102,6 +102,7 @@ def _windows_of_missing_force(
     # no windows without a missing force
     if estimate.leaves_no_force:
         return ()
+    estimate = estimate.in_motion
     process = estimate.processes[port_number]
     if leaves_no_force:
         best_events = force_in_records(estimate.linearisation, port_number, process)
@@ -110,8 +111,10 @@ def _windows_of_missing_force(
         best_events = find_events(estimate.linearisation, port_number, process, evidence_of_law)
     # the size of a window is that of the readings that the force causes in it
     readings_by_force = []
-    for smoothed_trial in estimate.trials:
-        trial = smoothed_trial.trial
+    for smoothed_trial, linear_trial in zip(
+        estimate.trials, estimate.linearisation.in_motion, strict=True
+    ):
+        trial = linear_trial.trial
         force = smoothed_trial.lacking_forces[port_number]
         readings_by_force.append(
             trial.readings_of_state(
@@ -264,8 +267,8 @@ def _port_or_channel_error(
     estimate : Estimate
         The more probable of both.
     """
-    linearisation = at_port.linearisation
-    trials = [linear_trial.trial for linear_trial in linearisation.trials]
+    linearisation = at_port.in_motion.linearisation
+    trials = [linear_trial.trial for linear_trial in linearisation.in_motion]
     longest_duration = max(float(np.ptp(trial.time)) for trial in trials)
     best_port = port
     best_estimate = at_port

@@ -167,11 +167,6 @@ class FittedCandidates:
         """Return whether the best candidate fails the test of absolute fit, or cannot be tested."""
         return not check_absolute_fit(self.problem, self.best()).passed
 
-    @property
-    def is_all_in_motion(self) -> bool:
-        """Whether all trials are in motion."""
-        return all(data.trial.is_dynamic for data in self.problem.trials)
-
     def fit_to_convergence(self, rough_fit: CandidateFit) -> CandidateFit:
         """Return a candidate fitted to convergence from a rough fit, and record the fit.
 

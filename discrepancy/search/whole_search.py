@@ -29,10 +29,10 @@ def search(
 ) -> Search:
     """Search the catalogue for the set of effects that explains a campaign.
 
-    The model without effect is fitted first. If all trials are in motion, each with at least as
-    many channels as the model has ports, sets of effects are compared by the force that they leave
-    missing. Otherwise, or if that force cannot be estimated, single effects are fitted to the
-    readings, then sets.
+    The model without effect is fitted first. If there are trials in motion, and each trial has at
+    least as many channels as the model has ports, sets of effects are compared by the force that
+    they leave missing. Otherwise, or if that force cannot be estimated, single effects are fitted
+    to the readings, then sets.
 
     Parameters
     ----------
@@ -70,7 +70,7 @@ def search(
         if second_fit is not None and second_fit.objective < no_effect.objective - least_gain:
             result = Search(problem, usable_effects, second_fit, on_progress=on_progress)
     on_search(result)
-    force_search = result.force_search if result.is_all_in_motion else None
+    force_search = result.force_search
     if force_search is not None and force_search.ported.has_channel_for_each_port:
         result.search_by_missing_force(force_search)
     else:

@@ -13,7 +13,14 @@ from calibration.result.record import ParameterPrior
 from discrepancy.campaign.records import Campaign, FloatArray, Quantity, Start, Trial, TrialKind
 from discrepancy.campaign.units import quantity_with_unit
 from discrepancy.errors import ModelError
-from discrepancy.system.response import EITHER, Conditions, Outputs, PortedSystem, Response
+from discrepancy.system.response import (
+    EITHER,
+    Conditions,
+    Outputs,
+    PortedSystem,
+    PortsAtRest,
+    Response,
+)
 from discrepancy.system.scales import Scales
 from fe.runtime.errors import FiniteElementError
 from fe.runtime.patch import (
@@ -217,6 +224,15 @@ class Model(ABC):
             accordingly.
         """
         raise NotImplementedError
+
+    def _ports_at_rest(self, trial: Trial, outputs: Outputs, conditions: Conditions) -> PortsAtRest:
+        """Return the ports in a trial at rest, without laws.
+
+        The caller, `ports_at_rest`, has checked the outputs.
+        """
+        raise ModelError(
+            f"{capital(self.quoted_name)} does not tell how a force at a port acts at rest."
+        )
 
     def _ported_system(
         self, trial: Trial, outputs: Outputs, parameters: FloatArray
@@ -467,12 +483,39 @@ class Model(ABC):
         ModelError
             If the model has sensors built in, whose effect on a missing force is not modelled.
         """
+        self._check_missing_forces(outputs)
+        return self._ported_system(trial, outputs, parameters)
+
+    def ports_at_rest(self, trial: Trial, outputs: Outputs, conditions: Conditions) -> PortsAtRest:
+        """Return the ports of the model in a trial at rest, and what forces at them do.
+
+        The laws of the model are left out.
+
+        Parameters
+        ----------
+        trial : Trial
+            The trial at rest.
+        outputs : tuple of (str, Quantity)
+            Outputs, and the quantity wanted of each.
+        conditions : Conditions
+            Parameters and health.
+
+        Raises
+        ------
+        ModelError
+            If the model has sensors built in, has no position of rest, or does not tell how a force
+            at a port acts at rest.
+        """
+        self._check_missing_forces(outputs)
+        return self._ports_at_rest(trial, outputs, conditions)
+
+    def _check_missing_forces(self, outputs: Outputs) -> None:
+        """Raise `ModelError` if outputs do not show a missing force as a linear system does."""
         self.check_outputs(outputs)
         if len(self.built_in_sensors):
             raise ModelError(
                 f"{self.name} has sensors built in, which hide a missing force; leave them out."
             )
-        return self._ported_system(trial, outputs, parameters)
 
     # ------------------------------------------------------------ the model with changes
 

@@ -112,6 +112,42 @@ class PortedSystem:
     through: FloatArray
 
 
+@dataclass(frozen=True, eq=False)
+class PortsAtRest:
+    """The ports of a linear model in a trial at rest of N rows, and what forces at them do.
+
+    With forces g at the ports, which act against their motion, the positions of the ports are
+    x - C g, and the C outputs change by -E g.
+
+    Attributes
+    ----------
+    positions : (N, P) ndarray
+        The positions x of the P ports without these forces [m or rad]; 0 at a port of a state.
+    compliance : (N, P, P) ndarray
+        C: the positions of the ports (second axis) by a unit force at each port (last axis).
+    outputs_by_force : (N, P, C) ndarray
+        E: the outputs by a unit force at each port.
+    """
+
+    positions: FloatArray
+    compliance: FloatArray
+    outputs_by_force: FloatArray
+
+    def minus(self, other: "PortsAtRest") -> "PortsAtRest":
+        """Return the difference to the ports under other conditions."""
+        return PortsAtRest(
+            self.positions - other.positions,
+            self.compliance - other.compliance,
+            self.outputs_by_force - other.outputs_by_force,
+        )
+
+    def times(self, factor: float) -> "PortsAtRest":
+        """Return all arrays times a factor."""
+        return PortsAtRest(
+            factor * self.positions, factor * self.compliance, factor * self.outputs_by_force
+        )
+
+
 Outputs = tuple[tuple[str, Quantity], ...]
 """Names of outputs, and the quantity wanted of each."""
 ACROSS = ".transverse", ".shear"

@@ -1,7 +1,7 @@
 """Models that are given by matrices (a wing, a structure, a lumped rig), at rest and in motion."""
 
 from abc import abstractmethod
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from functools import cached_property, lru_cache
 from itertools import groupby
@@ -14,6 +14,11 @@ from discrepancy.system.excitation import Excitation, Load, ReleasePoint
 from discrepancy.system.interface import NO_PATCH, Model
 from discrepancy.system.linear_system import LinearSystem
 from discrepancy.system.load_change import LoadChange, require_release
+from discrepancy.system.loaded_system import (
+    LoadedSystem,
+    errors_at_rest,
+    ports_of_blocks,
+)
 from discrepancy.system.motion import Motion, simulate_motion
 from discrepancy.system.natural_state import natural_state_magnitudes
 from discrepancy.system.output_equation import OutputEquation
@@ -27,7 +32,14 @@ from discrepancy.system.port_scales import (
     scales_of_moving_structure,
 )
 from discrepancy.system.ported_system import ported_system
-from discrepancy.system.response import Conditions, Outputs, Place, PortedSystem, Response
+from discrepancy.system.response import (
+    Conditions,
+    Outputs,
+    Place,
+    PortedSystem,
+    PortsAtRest,
+    Response,
+)
 from discrepancy.system.scales import PortScale, Scales
 from discrepancy.system.system_state import (
     ExcitedSystem,
@@ -280,25 +292,38 @@ class SystemModel(Model):
         # what the laws remember of the loading, and the last load level, from one block to the next
         memory = None
         previous_level = None
-        for rows, state in self._rows_by_state(case):
-            case_in_state = case._replace(state=state)
-            equations = self.output_equations(case_in_state, outputs, None)
-            directions, levels_of_trial = self.excitation(case_in_state).load_levels
-            system = self.system_in_state(state)
-            output_rows = _output_rows_at_rest(trial, outputs, equations, system.displacement_count)
-            trial_text = f"The trial {trial.name!r} is at rest, but "
-            with ModelError.instead_of(ModelError, FiniteElementError, before=trial_text):
-                values[rows], memory = system.static_path(
-                    directions,
+        for block in self._loaded_systems(case, outputs):
+            rows = block.rows
+            with errors_at_rest(trial):
+                values[rows], memory = block.system.static_path(
+                    block.directions,
                     laws,
-                    levels=levels_of_trial[rows],
+                    levels=block.levels[rows],
                     memory=memory,
                     previous_level=previous_level,
-                    output_rows=output_rows,
+                    output_rows=block.output_rows,
                 )
-            values[rows] += [equation.constant for equation in equations]
-            previous_level = levels_of_trial[rows.stop - 1]
+            values[rows] += block.constants
+            previous_level = block.levels[rows.stop - 1]
         return values
+
+    def _ports_at_rest(self, trial: Trial, outputs: Outputs, conditions: Conditions) -> PortsAtRest:
+        """Return the ports in a trial at rest, without laws; a port of a state does not move."""
+        case = self.patched_trial(trial, conditions, self.patch.in_trial(trial.name))
+        return ports_of_blocks(trial, self.ports, self._loaded_systems(case, outputs))
+
+    def _loaded_systems(self, case: PatchedTrial, outputs: Outputs) -> Iterator[LoadedSystem]:
+        """Yield the linear system of a trial at rest, with loads and outputs, by block of rows."""
+        for rows, state in self._rows_by_state(case):
+            case_in_state = case._replace(state=state)
+            yield LoadedSystem.of_trial(
+                case.trial,
+                rows,
+                self.system_in_state(state),
+                self.excitation(case_in_state).load_levels,
+                outputs,
+                self.output_equations(case_in_state, outputs, None),
+            )
 
     def _rows_by_state(self, case: PatchedTrial) -> Iterator[RowsAtRest]:
         """Yield blocks of consecutive rows of a static trial in which the structure is the same.
@@ -316,9 +341,8 @@ class SystemModel(Model):
         # a single entry holds for all rows
         if len(losses_of_rows) == 1:
             losses_of_rows = losses_of_rows * row_count
-        temperature_rises = [0.0] * row_count
-        if _depends_on_temperature(case.patch):
-            temperature_rises = case.trial.temperature.tolist()
+        rises_count = _depends_on_temperature(case.patch)
+        temperature_rises = case.trial.temperature.tolist() if rises_count else [0.0] * row_count
         start = 0
         for (row_losses, temperature_rise), equal_rows in groupby(
             zip(losses_of_rows, temperature_rises, strict=True)
@@ -538,34 +562,6 @@ class SystemModel(Model):
         return np.asarray(
             stated_displacement / displacement_under_unit_force * shape_under_unit_force
         )
-
-
-def _output_rows_at_rest(
-    trial: Trial,
-    outputs: Outputs,
-    equations: Sequence[OutputEquation],
-    displacement_count: int,
-) -> FloatArray:
-    """Return the matrix (C, N) that gives the C outputs of a structure at rest from its N unknowns.
-
-    The first `displacement_count` unknowns are displacements. The others are integrals of states of
-    first order, so that the rate of such an unknown is the value of its state. At rest an output
-    depends on displacements (row 0 of its equation) and on values of states (row 1). Raises
-    `ModelError` if an output is a velocity, an acceleration or the rate of a state.
-    """
-    output_rows = []
-    for (_, quantity), equation in zip(outputs, equations, strict=True):
-        shows_state_rate = np.any(equation.rows[2:, displacement_count:])
-        shows_speed = quantity.order > 0 and np.any(equation.rows[1:, :displacement_count])
-        if shows_state_rate or shows_speed:
-            raise ModelError(
-                f"The trial {trial.name!r} is at rest, but a channel measures velocity or "
-                "acceleration."
-            )
-        displacement_row = equation.rows[0, :displacement_count]
-        state_row = equation.rows[1, displacement_count:]
-        output_rows.append(np.append(displacement_row, state_row))
-    return np.array(output_rows)
 
 
 def _depends_on_temperature(patch: ModelPatch) -> bool:

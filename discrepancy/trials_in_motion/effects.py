@@ -8,11 +8,11 @@ from functools import cached_property, lru_cache, partial
 import numpy as np
 
 from discrepancy.campaign.records import FloatArray
-from discrepancy.errors import DiscrepancyError
+from discrepancy.errors import DiscrepancyError, ModelError
 from discrepancy.fits.candidate import Candidate, EffectTerm, Point, with_step
 from discrepancy.fits.problem import Problem
 from discrepancy.system.interface import NO_PATCH
-from fe.runtime.errors import InvalidPatchError
+from fe.runtime.errors import InvalidPatchError, SolutionError
 from fe.runtime.laws.interface import PortForce
 from fe.runtime.patch import ModelPatch, Primitive
 from reporting.arrays import LEAST_DIVISOR
@@ -21,7 +21,7 @@ from .laws import LawForce, force_and_tangents, holds_at_rest
 from .sensor_errors import ReadingChanges
 from .simulated import motion_under_laws
 from .trajectory import LawArguments, LinearisedForce, LinearisedSensorErrors, Trajectory
-from .trial import PortedTrial
+from .trial_at_rest import LinearTrial, TrialAtRest
 
 HALF_DIFFERENCE = 0.02
 """Half the difference of an unknown in a derivative by it; unknowns are standard normal."""
@@ -37,8 +37,8 @@ class EffectLaws:
     ----------
     problem : Problem
         The campaign and the model without its own laws, with the layout of their unknowns.
-    trials : tuple of PortedTrial
-        The dynamic trials as linear systems with ports.
+    trials : tuple of PortedTrial or TrialAtRest
+        The trials, linear, with ports.
     trial_indices : sequence of int
         The indices of these trials in the problem.
     candidate : Candidate
@@ -50,7 +50,7 @@ class EffectLaws:
     """
 
     problem: Problem
-    trials: tuple[PortedTrial, ...]
+    trials: tuple[LinearTrial, ...]
     trial_indices: Sequence[int]
     candidate: Candidate
     evaluate_model_laws: Callable[[FloatArray], ModelPatch]
@@ -104,11 +104,19 @@ class EffectLaws:
             laws = self._laws_in_patch(self._patch_of_all_laws(arguments))
         except (DiscrepancyError, InvalidPatchError):
             return None
+        trial = self.trials[arguments.trial_index]
+        if isinstance(trial, TrialAtRest):
+            try:
+                return trial.trajectory_under_laws(
+                    laws, np.concatenate((arguments.shared, local_values))
+                )
+            except (SolutionError, InvalidPatchError):
+                return None
         # The smoothed steps of friction are half as wide as in the linearised laws, so that a body
         # at rest in this motion lies well within the window of the linearised laws.
         rms_speeds = np.sqrt(np.mean(arguments.trajectory.speeds**2, axis=0))
         return motion_under_laws(
-            self.trials[arguments.trial_index],
+            trial,
             laws,
             arguments.shared,
             local_values,
@@ -272,7 +280,13 @@ class EffectLaws:
         trial = self.trials[arguments.trial_index]
         forces: dict[int, LawForce] = {}
         for law in self._laws_in_patch(patch):
-            port_number = trial.system.ports.index(law.port)
+            if trial.is_at_rest and type(law).depends_on_speed:
+                continue  # a law of the speed has no force at rest
+            if trial.is_at_rest and law.windows:
+                raise ModelError(
+                    f"The trial {trial.name!r} has no time, which a law in time asks for."
+                )
+            port_number = trial.ports.index(law.port)
             force = force_and_tangents(
                 law,
                 trial.fine_time,
@@ -310,7 +324,10 @@ class EffectLaws:
         if not any(is_error):
             return LinearisedSensorErrors(change, derivatives)
         forces = {port: force.law_force.force for port, force in linearised_forces.items()}
-        explained = self._explained_trajectory(arguments, forces)
+        # Errors of sensors act on the motion by the model and the forces of all laws. That by
+        # missing forces is left out: it is estimated from the readings, so that its product with an
+        # error would explain them by themselves.
+        explained = trial.trajectory_under(forces)
 
         def change_by_effect(term: EffectTerm, values: FloatArray) -> FloatArray:
             return self.readings_change(arguments.trial_index, explained, term, values)
@@ -328,26 +345,6 @@ class EffectLaws:
                     )
             first_unknown += len(values)
         return LinearisedSensorErrors(change, derivatives)
-
-    def _explained_trajectory(
-        self, arguments: LawArguments, forces: Mapping[int, FloatArray]
-    ) -> Trajectory:
-        """Return the motion of a trial by the model and the forces of all laws.
-
-        Errors of sensors are computed from this motion. It leaves out the motion by missing forces,
-        which is estimated from the readings: multiplied by an error of a sensor, it would explain
-        the readings by themselves. `forces` are those of all laws, by the number of the port.
-        """
-        trial = self.trials[arguments.trial_index]
-        added_state = np.zeros_like(arguments.trajectory.added_state)
-        for port, force in forces.items():
-            added_state += trial.state_under_force(port, force)
-        return Trajectory(
-            added_state,
-            positions=trial.port_positions + added_state @ trial.system.positions.T,
-            speeds=trial.port_speeds + added_state @ trial.system.speeds.T,
-            forces=forces,
-        )
 
     def readings_change(
         self, trial_index: int, trajectory: Trajectory, term: EffectTerm, values: FloatArray
@@ -373,4 +370,6 @@ class EffectLaws:
         if self.problem.trials[index_in_problem].trial.kind not in term.effect.acts_on:
             return np.zeros_like(trial.residual)
         patch = term.patch(self.problem.setting, values).in_trial(trial.name)
+        if len(patch.of(PortForce)):  # a law of the speed in a trial at rest
+            return np.zeros_like(trial.residual)
         return ReadingChanges(self.problem).change(trial, trajectory, index_in_problem, patch)

@@ -97,7 +97,7 @@ def ported_trial(problem: Problem, trial_index: int, point: Point) -> PortedTria
     substeps = _substep_count(system, trial.time)
     # response of the model, about which the missing forces are added
     positions_and_speeds, by_unknowns = _port_motion(problem, trial_index, point, substeps)
-    residual, by_shared, by_local = _residual_and_derivatives(problem, trial_index, point)
+    residual, by_shared, by_local = residual_and_derivatives(problem, trial_index, point)
     deviation = trial.noise_factor * np.array(
         [noise.static_deviation for noise in data.noise_models]
     )
@@ -121,7 +121,7 @@ def ported_trial(problem: Problem, trial_index: int, point: Point) -> PortedTria
         port_speeds=positions_and_speeds[1],
         begins_at_rest=trial.begins.value == "settled" and trial.kind.value != "ringdown",
         linearisation_point=np.concatenate((point.shared, point.local[trial_index])),
-        gain_unknowns=_gain_unknowns(problem, trial, gains),
+        gain_unknowns=gain_unknowns(problem, trial, gains),
         port_motion_derivatives=by_unknowns,
     )
 
@@ -168,7 +168,7 @@ def thin_trial(trial: PortedTrial, wanted_stride: float) -> PortedTrial:
     return trial.thinned(stride, max(trial.substeps, FEWEST_SUBSTEPS))
 
 
-def _residual_and_derivatives(
+def residual_and_derivatives(
     problem: Problem, trial_index: int, unknowns: Point
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return the residuals at zero unknowns, and the derivatives of the readings.
@@ -208,7 +208,7 @@ def _residual_and_derivatives(
     return residual, by_shared, by_local
 
 
-def _gain_unknowns(problem: Problem, trial: Trial, gains: FloatArray) -> list[GainUnknown]:
+def gain_unknowns(problem: Problem, trial: Trial, gains: FloatArray) -> list[GainUnknown]:
     """Return the shared unknowns that are gains of the trial's channels.
 
     Parameters

@@ -13,6 +13,7 @@ from fe.runtime.sensors import clock_of
 
 from .trajectory import Trajectory
 from .trial import PortedTrial
+from .trial_at_rest import LinearTrial
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,7 +29,11 @@ class ReadingChanges:
     problem: Problem
 
     def change(
-        self, trial: PortedTrial, trajectory: Trajectory, trial_index: int, patch: ModelPatch
+        self,
+        trial: LinearTrial,
+        trajectory: Trajectory,
+        trial_index: int,
+        patch: ModelPatch,
     ) -> FloatArray:
         """Return the change (N, C) of a trial's readings by a patch, divided by the noise.
 
@@ -37,8 +42,8 @@ class ReadingChanges:
 
         Parameters
         ----------
-        trial : PortedTrial
-            The trial as a linear system with ports.
+        trial : PortedTrial or TrialAtRest
+            The linear trial with ports.
         trajectory : Trajectory
             The motion that the sensors measure, with the forces at ports.
         trial_index : int
@@ -55,7 +60,7 @@ class ReadingChanges:
         return self._readings_of_sensor_errors(trial, trajectory, trial_index, sensors)
 
     def _readings_of_changed_model(
-        self, trial: PortedTrial, trial_index: int, patch: ModelPatch
+        self, trial: LinearTrial, trial_index: int, patch: ModelPatch
     ) -> FloatArray:
         """Return the simulated change (N, C) of the readings by a patch, divided by the noise.
 
@@ -72,7 +77,11 @@ class ReadingChanges:
         return trial.divide_by_noise(((patched_response - response) * gains)[:: trial.stride])
 
     def _readings_of_sensor_errors(
-        self, trial: PortedTrial, trajectory: Trajectory, trial_index: int, sensors: ModelPatch
+        self,
+        trial: LinearTrial,
+        trajectory: Trajectory,
+        trial_index: int,
+        sensors: ModelPatch,
     ) -> FloatArray:
         """Return the change (N, C) of the readings by errors of sensors, divided by the noise.
 
@@ -94,7 +103,7 @@ class ReadingChanges:
         added_readings = trial.readings_of_state(trajectory.added_state, trajectory.forces)
         true_values = response + added_readings * trial.deviation / gains
         true_rates = None
-        if rates is not None:
+        if rates is not None and isinstance(trial, PortedTrial):
             true_rates = rates + _added_rates(trial, trajectory) / gains
         # the readings of the sensors with their errors
         conditions = data.unknowns.conditions(
@@ -111,7 +120,7 @@ class ReadingChanges:
             change += true_rates * clock_error[:, None]
         return trial.divide_by_noise(change * gains)
 
-    def _linearisation_point(self, trial: PortedTrial) -> tuple[FloatArray, FloatArray]:
+    def _linearisation_point(self, trial: LinearTrial) -> tuple[FloatArray, FloatArray]:
         """Return the shared (K,) and the local (L,) unknowns about which a trial is linear."""
         shared_count = self.problem.shared.unknown_count
         shared_values, local_values = np.split(trial.linearisation_point, [shared_count])

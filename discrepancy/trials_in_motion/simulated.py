@@ -384,7 +384,7 @@ def motion_under_laws(
         speeds,
         forces,
     )
-    ports = sorted({trial.system.ports.index(law.port) for law in laws})
+    ports = sorted({trial.ports.index(law.port) for law in laws})
     return Trajectory(states, positions, speeds, {port: forces[:, port] for port in ports})
 
 
@@ -415,7 +415,7 @@ def _law_arrays(trial: PortedTrial, laws: Sequence[PortForce]) -> LawArrays:
         acting[number] = law.acts_at(trial.fine_time)
     memory_size = FIRST_ELEMENT + max(1, parameters.shape[1] - PARAMETERS)
     return LawArrays(
-        ports=np.array([trial.system.ports.index(law.port) for law in laws], dtype=np.int64),
+        ports=np.array([trial.ports.index(law.port) for law in laws], dtype=np.int64),
         numbers=np.array([LAWS.index(type(law)) for law in laws], dtype=np.int64),
         parameters=parameters,
         of_speed=np.array([type(law).depends_on_speed for law in laws], dtype=np.bool_),

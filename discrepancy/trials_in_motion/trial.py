@@ -23,6 +23,7 @@ from discrepancy.system.response import PortedSystem
 from discrepancy.system.time_history import subdivide
 
 from .steps import respond_to_inputs, state_under_inputs
+from .trajectory import Trajectory
 
 NO_FORCES: Mapping[int, FloatArray] = MappingProxyType({})
 """The forces by port of a trial in which no force acts: an empty mapping."""
@@ -166,6 +167,13 @@ class PortedTrial:
     gain_unknowns: Sequence[GainUnknown] = ()
     port_motion_derivatives: Mapping[int, FloatArray] = field(default_factory=dict)
     stride: int = 1
+
+    is_at_rest = False
+
+    @property
+    def ports(self) -> tuple[str, ...]:
+        """The names of the ports."""
+        return self.system.ports
 
     def thinned(self, stride: int, substeps: int) -> "PortedTrial":
         """Return the trial with every `stride`-th sample, at equal intervals.
@@ -332,6 +340,44 @@ class PortedTrial:
             np.ascontiguousarray(inputs),
         )
         return np.asarray(states)
+
+    def trajectory_of_model(self) -> Trajectory:
+        """Return the motion by the linear model alone, to which no force adds anything."""
+        no_state = np.zeros((len(self.fine_time), len(self.system.generator)))
+        return Trajectory(no_state, self.port_positions, self.port_speeds, {})
+
+    def trajectory_under(self, forces: Mapping[int, FloatArray]) -> Trajectory:
+        """Return the motion by the linear model and by forces (F,) at ports, by port."""
+        model = self.trajectory_of_model()
+        added_state = self._state_under_forces(forces)
+        return Trajectory(
+            added_state,
+            positions=model.positions + added_state @ self.system.positions.T,
+            speeds=model.speeds + added_state @ self.system.speeds.T,
+            forces=forces,
+        )
+
+    def trajectory_without(
+        self, trajectory: Trajectory, forces: Mapping[int, FloatArray]
+    ) -> Trajectory:
+        """Return a trajectory minus what some of its forces (F,), by port, add to it."""
+        state = self._state_under_forces(forces)
+        remaining_forces = dict(trajectory.forces)
+        for port, force in forces.items():
+            remaining_forces[port] = remaining_forces[port] - force
+        return Trajectory(
+            trajectory.added_state - state,
+            trajectory.positions - state @ self.system.positions.T,
+            trajectory.speeds - state @ self.system.speeds.T,
+            remaining_forces,
+        )
+
+    def _state_under_forces(self, forces: Mapping[int, FloatArray]) -> FloatArray:
+        """Return the state (F, n) that forces (F,) at ports, by port, add."""
+        state = np.zeros((len(self.fine_time), len(self.system.generator)))
+        for port, force in forces.items():
+            state += self.state_under_force(port, force)
+        return state
 
     def readings_of_state(
         self, states: FloatArray, forces: Mapping[int, FloatArray] = NO_FORCES

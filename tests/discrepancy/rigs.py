@@ -120,6 +120,15 @@ def measured(drag: float = 0.0, kind: str = "laboratory") -> tuple[Campaign, Lum
     return simulated(model, kind, 4, ("quadratic_damping", values, "slide") if drag else None), model
 
 
+def drag_beside_a_drift(folder: Path | None = None) -> tuple[Campaign, LumpedModel]:
+    """The rig with drag and a stiffness that falls: the drift takes some of the error away, not most."""
+    model = LumpedModel.load(MODEL)
+    campaign = simulated(model, "laboratory", 4)
+    hidden = hiding(campaign, model, "quadratic_damping", {"equivalent_damping_ratio": 0.01}, "slide")
+    hidden = hidden + hiding(campaign, model, "stiffness_drift", {"stiffness_change": 0.02}, "")
+    return simulated(model, "laboratory", 4, hidden, folder), model
+
+
 FEW = chosen(
     "quadratic_damping", "coulomb_friction", "structural_damping", "gauge_gain", "load_cell", "washout"
 )

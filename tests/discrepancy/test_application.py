@@ -34,7 +34,7 @@ from reporting.errors import FileNotWrittenError
 from reporting.provenance import collect_provenance
 from tests import command_line
 from tests.discrepancy.core.kit import problem_of
-from tests.discrepancy.rigs import chosen, fmu_rig, hiding, simulated
+from tests.discrepancy.rigs import chosen, drag_beside_a_drift, fmu_rig, hiding, simulated
 
 
 def run(*words, failed=False):
@@ -351,14 +351,10 @@ def test_what_is_no_member_of_a_group_is_refused(group_verdict):
 
 @pytest.fixture(scope="module")
 def unexplained(tmp_path_factory):
-    """The verdict on drag with nothing but a stiffness that drifts to explain it, and its folder.
-
-    The drift takes some of the error away.
-    """
+    """The verdict on drag beside a drift, with nothing but the drift to explain both, and its folder."""
     folder = tmp_path_factory.mktemp("unexplained")
     choice = choose_model("single_mass_rig")
-    hidden = ("quadratic_damping", {"equivalent_damping_ratio": 0.01}, "slide")
-    campaign = simulated(choice.model, "laboratory", 4, hidden, folder / "campaign")
+    campaign, _ = drag_beside_a_drift(folder / "campaign")
     return verdict_of(choice, campaign, chosen("stiffness_drift"), folder / "verdict"), folder / "verdict"
 
 

@@ -26,7 +26,16 @@ from discrepancy.workflow import Investigation, investigate
 from fe.runtime.patch import PowerDamping
 from tests.costs import once
 from tests.discrepancy.bench import Bench
-from tests.discrepancy.rigs import ORIGIN, chosen, drag_found, integrated, measured, model_of, simulated
+from tests.discrepancy.rigs import (
+    ORIGIN,
+    chosen,
+    drag_beside_a_drift,
+    drag_found,
+    integrated,
+    measured,
+    model_of,
+    simulated,
+)
 from tests.refusals import Inputs
 
 from . import kit
@@ -205,7 +214,7 @@ def compliant_root(share):
 CAMPAIGNS = {
     "named without a noise record": (lambda: rig(0.01, noise=None), ("quadratic_damping",)),
     "without its effect": (lambda: rig(0.01), (FRICTION,)),
-    "a drift alone": (lambda: rig(0.01), ("stiffness_drift",)),
+    "a drift beside drag": (drag_beside_a_drift, ("stiffness_drift",)),
     "coloured remainder": (lambda: slow_friction(3.0), ("quadratic_damping",)),
     "nothing missing": (rig, (FRICTION, "quadratic_damping")),
     "wide gains": (lambda: rig(0.01, gain_deviation=0.3), ("quadratic_damping", "gauge_gain")),

@@ -1,0 +1,255 @@
+"""A trial at rest, linear about its positions, with the laws of a hypothesis and missing forces.
+
+At each load step, the ports are at x and the readings are y. With the forces G of the hypothesis'
+laws, the missing forces f and the unknowns w, they obey
+
+    h = G(x; w) + f,    x = x_m(w) - C h,    y = r(w) - E h + noise.
+
+Here x_m and r are position and reading of the linear model, C its compliance and E the readings by
+unit forces. With laws that are linear about given positions, h is linear in w and f, since
+x is replaced: (I + T C) h = g + T x_m(w) + f, with the slopes T of the laws. This is the equation
+of a trial in motion without time (see `linearised`).
+
+A force that is missing in motion is missing at rest, too. It has the same standard deviation, and
+is independent from one load step to the next: by which displacements its values are related
+depends on the law, which is not known.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from discrepancy.campaign.records import FloatArray
+from discrepancy.trials_in_motion.trajectory import (
+    LinearisedForce,
+    LinearisedSensorErrors,
+    Trajectory,
+)
+from discrepancy.trials_in_motion.trial_at_rest import TrialAtRest
+
+from .filtered import SmoothedTrial
+from .linearised import CONSTANT, Simulation
+from .process_search import Processes
+
+
+@dataclass(frozen=True, eq=False)
+class LinearisedRest:
+    """A trial at rest, linear along its positions; it stands beside `LinearisedTrial`.
+
+    Shapes: N load steps, C channels, P ports, W weights (one, then the K shared unknowns, the E of
+    effects, and those of the trial alone).
+
+    Attributes
+    ----------
+    trial : TrialAtRest
+        The trial with its residuals and the compliance of the model.
+    trajectory : Trajectory
+        The positions of the ports, and the forces there, about which it is linear.
+    forces : mapping of int to LinearisedForce
+        The forces of all laws, by the number of the port.
+    sensor_errors : LinearisedSensorErrors
+        The changes of readings by the hypothesis' effects of sensors.
+    effect, shared : (E,), (K,) ndarray
+        The values of the unknowns of effects, and of the shared ones, about which it is linear.
+    simulation : Simulation or None
+        The trial as simulated with these values.
+    """
+
+    trial: TrialAtRest
+    trajectory: Trajectory
+    forces: Mapping[int, LinearisedForce]
+    sensor_errors: LinearisedSensorErrors
+    effect: FloatArray
+    shared: FloatArray
+    simulation: Simulation | None = None
+
+    @property
+    def weight_count(self) -> int:
+        """The number W of weights: the first is one, the others are the unknowns."""
+        return 1 + len(self.shared) + len(self.effect) + len(self.trial.local_derivatives)
+
+    def weight_index(self, unknown_index: int) -> int:
+        """Return the index among the weights of an unknown of `TrialAtRest.linearisation_point`.
+
+        The unknowns of effects are between the shared ones and those of the trial alone.
+        """
+        is_local = unknown_index >= len(self.shared)
+        return 1 + unknown_index + (len(self.effect) if is_local else 0)
+
+    @property
+    def effect_forces(self) -> dict[int, FloatArray]:
+        """The forces (N,) of the hypothesis' effects along the trajectory, by port."""
+        return {port: force.law_force.force - force.by_model for port, force in self.forces.items()}
+
+    @cached_property
+    def _position_slopes(self) -> FloatArray:
+        """T, the slopes (N, P) of the laws' force at each port by its position."""
+        slopes = np.zeros_like(self.trial.response.positions)
+        for port, force in self.forces.items():
+            slopes[:, port] = force.law_force.by_position
+        return slopes
+
+    @cached_property
+    def force_by_own_force(self) -> FloatArray:
+        """(I + T C)^-1 (N, P, P): the force h at each port by an own force there, laws included."""
+        compliance = self.trial.response.compliance
+        identity = np.eye(compliance.shape[1])
+        return np.asarray(np.linalg.inv(identity + self._position_slopes[:, :, None] * compliance))
+
+    @cached_property
+    def positions_by_weight(self) -> FloatArray:
+        """The positions (N, P, W) by the model alone; derivatives by unknowns at the forces there.
+
+        An unknown changes the positions by the loads and, as it changes the compliance, by the
+        forces.
+        """
+        trial = self.trial
+        positions = np.zeros((*trial.response.positions.shape, self.weight_count))
+        positions[:, :, CONSTANT] = trial.response.positions
+        for number, derivative in trial.response_derivatives.items():
+            change = derivative.positions + trial.added_positions(
+                derivative, self.trajectory.forces
+            )
+            positions[:, :, self.weight_index(number)] += change
+            positions[:, :, CONSTANT] -= trial.linearisation_point[number] * change
+        return positions
+
+    @cached_property
+    def force_by_weight(self) -> FloatArray:
+        """The force h (N, P, W) at each port without missing forces, for a unit of each weight."""
+        forces = self._position_slopes[:, :, None] * self.positions_by_weight
+        unknowns = np.concatenate((self.shared, self.effect))
+        for port, force in self.forces.items():
+            law = force.law_force
+            forces[:, port, CONSTANT] += (
+                law.force - law.by_position * self.trajectory.positions[:, port]
+            )
+            for number, derivative in force.by_unknown.items():
+                forces[:, port, 1 + number] += derivative
+                forces[:, port, CONSTANT] -= unknowns[number] * derivative
+        return np.asarray(self.force_by_own_force @ forces)
+
+    @cached_property
+    def columns(self) -> FloatArray:
+        """The residuals (N, C, W) without missing forces, for a unit of each weight.
+
+        First the readings minus their prediction at zero unknowns, then minus the derivatives of
+        the prediction by the unknowns. All are divided by the noise, and zero for a reading that
+        does not count.
+        """
+        trial = self.trial
+        columns = np.zeros((*trial.residual.shape, self.weight_count))
+        columns[:, :, CONSTANT] = trial.residual - self.sensor_errors.change
+        # errors of sensors change the readings by c0 + d (u - u0), which lowers the residual
+        unknowns = np.concatenate((self.shared, self.effect))
+        for number, derivative in self.sensor_errors.by_unknown.items():
+            columns[:, :, 1 + number] -= derivative
+            columns[:, :, CONSTANT] += unknowns[number] * derivative
+        # the response of the model is linear about zero unknowns already
+        derivatives = np.concatenate((trial.shared_derivatives, trial.local_derivatives))
+        for number, derivative in enumerate(derivatives):
+            columns[:, :, self.weight_index(number)] -= derivative
+        # parameters and gains change the readings of given forces
+        for number, derivative in self._readings_by_unknowns().items():
+            columns[:, :, self.weight_index(number)] -= derivative
+            columns[:, :, CONSTANT] += trial.linearisation_point[number] * derivative
+        columns += np.einsum("npc,npw->ncw", trial.response.outputs_by_force, self.force_by_weight)
+        if self.simulation is not None:
+            # at the values of the simulation, the residual is that of the simulation
+            weights = np.concatenate(([1.0], unknowns, self.simulation.local))
+            columns[:, :, CONSTANT] += self.simulation.residual - columns @ weights
+        return columns * trial.used[:, :, None]
+
+    def _readings_by_unknowns(self) -> dict[int, FloatArray]:
+        """Return the derivatives (N, C) of the readings of the forces, by parameters and gains."""
+        trial = self.trial
+        forces = self.trajectory.forces
+        derivatives = {
+            number: trial.readings_of_forces(derivative, forces)
+            for number, derivative in trial.response_derivatives.items()
+        }
+        readings = trial.readings_of_forces(trial.response, forces)
+        for number, channel, scale in trial.gain_unknowns:
+            derivatives[number] = readings * scale * np.eye(readings.shape[1])[channel]
+        return derivatives
+
+
+@dataclass(frozen=True, eq=False)
+class RestUnderForces:
+    """A trial at rest under given missing forces; it stands beside `FilteredTrial`.
+
+    Attributes
+    ----------
+    linear_trial : LinearisedRest
+        The trial, linear along its positions.
+    processes : mapping of int to Process
+        The missing forces, by the number of the port.
+    """
+
+    linear_trial: LinearisedRest
+    processes: Processes
+
+    @cached_property
+    def _deviations(self) -> FloatArray:
+        """The standard deviation (M,) of the missing force at each of M ports."""
+        return np.array([process.standard_deviation for process in self.processes.values()])
+
+    @cached_property
+    def _residual_by_force(self) -> FloatArray:
+        """The residuals (N, C, M) by missing forces of one standard deviation."""
+        linear_trial = self.linear_trial
+        own_forces = linear_trial.force_by_own_force[:, :, list(self.processes)]
+        outputs_by_force = linear_trial.trial.response.outputs_by_force
+        own_forces = own_forces * self._deviations
+        return np.asarray(np.einsum("npc,npm->ncm", outputs_by_force, own_forces))
+
+    @cached_property
+    def _factor(self) -> FloatArray:
+        """The Cholesky factor (N, C, C) of the covariance of the residuals."""
+        by_force = self._residual_by_force
+        covariance = np.eye(by_force.shape[1]) + by_force @ np.swapaxes(by_force, 1, 2)
+        return np.asarray(np.linalg.cholesky(covariance))
+
+    @cached_property
+    def whitened_products(self) -> tuple[FloatArray, float]:
+        """The inner products (W, W) of the whitened columns, and half a log determinant [nat].
+
+        As those of `FilteredTrial`: the columns are the residual and its derivatives by the
+        unknowns, the determinant is that of the covariance of the readings.
+        """
+        columns = self.linear_trial.columns
+        whitened_columns = np.linalg.solve(self._factor, columns).reshape(-1, columns.shape[-1])
+        # the columns are minus the derivatives of the prediction: change the sign
+        whitened_columns[:, 1:] *= -1.0
+        diagonals = np.diagonal(self._factor, axis1=1, axis2=2)
+        return whitened_columns.T @ whitened_columns, float(np.sum(np.log(diagonals)))
+
+    def smooth(self, unknowns: FloatArray) -> SmoothedTrial:
+        """Return the positions and forces of the trial at values of the unknowns."""
+        linear_trial = self.linear_trial
+        trial = linear_trial.trial
+        weights = np.concatenate(([1.0], unknowns))
+        # f given the residual r = B f + noise, in standard deviations: mean B^T (I + B B^T)^-1 r
+        by_force = np.linalg.solve(self._factor, self._residual_by_force)
+        residual = np.linalg.solve(self._factor, (linear_trial.columns @ weights)[:, :, None])
+        missing = np.einsum("ncm,nc->nm", by_force, residual[:, :, 0]) * self._deviations
+        explained_shares = np.einsum("ncm,ncm->nm", by_force, by_force)
+        deviations = self._deviations * np.sqrt(np.maximum(1.0 - explained_shares, 0.0))
+        own_forces = linear_trial.force_by_own_force[:, :, list(self.processes)]
+        forces = linear_trial.force_by_weight @ weights
+        forces = forces + np.einsum("npm,nm->np", own_forces, missing)
+        positions = linear_trial.positions_by_weight @ weights
+        positions = positions - np.einsum("npq,nq->np", trial.response.compliance, forces)
+        acting_ports = {*linear_trial.forces, *self.processes}
+        return SmoothedTrial(
+            trial=trial,
+            trajectory=trial.trajectory_at(
+                positions, {port: forces[:, port] for port in acting_ports}
+            ),
+            missing_forces=dict(zip(self.processes, missing.T, strict=True)),
+            missing_force_deviations=dict(zip(self.processes, deviations.T, strict=True)),
+            effect_forces=linear_trial.effect_forces,
+            local=unknowns[len(linear_trial.shared) + len(linear_trial.effect) :],
+        )
