@@ -28,6 +28,8 @@ SEED = 20210527
 """Seed of the outcomes."""
 LEAST_INFORMATION = 0.03
 """Information below which an experiment is not proposed [nat]."""
+LEAST_SHARE = 0.1
+"""Share of the entropy of the open hypotheses that an experiment has to tell to be proposed."""
 MOST_PROPOSED = 4
 """Largest number of experiments that are proposed."""
 LEAST_PROBABILITY = 1e-3
@@ -73,8 +75,9 @@ def next_experiments(
 ) -> tuple[Experiment, ...]:
     """Return the experiments that best separate the open hypotheses, to propose them to the user.
 
-    An experiment is a feasible trial of at least `LEAST_INFORMATION`. At most `MOST_PROPOSED` are
-    returned, those of the largest information per cost first.
+    An experiment is a feasible trial that tells at least `LEAST_INFORMATION`, and `LEAST_SHARE` of
+    what is not known yet. At most `MOST_PROPOSED` are returned, those of the largest information
+    per cost first.
 
     Parameters
     ----------
@@ -84,6 +87,8 @@ def next_experiments(
     # a hypothesis of nearly no probability would make its logarithm infinite
     probabilities = np.array([max(probability, LEAST_PROBABILITY) for _, probability in open_fits])
     probabilities /= probabilities.sum()
+    entropy = -float(probabilities @ np.log(probabilities))
+    least_information = max(LEAST_INFORMATION, LEAST_SHARE * entropy)
     fits = [fit for fit, _ in open_fits]
     is_oscillating = oscillates(problem, fits[0]) if fits else True
     experiments = []
@@ -96,7 +101,7 @@ def next_experiments(
             information = mutual_information(problem, proposal, fits, probabilities)
         except DiscrepancyError:  # the model cannot simulate this trial
             continue
-        if information >= LEAST_INFORMATION:
+        if information >= least_information:
             experiments.append(
                 Experiment(proposal.description, information, proposal.cost, proposal.reason)
             )
