@@ -81,21 +81,27 @@ $(VENV)/bin/python:
 	@$(PYTHON) -c 'import sys; sys.exit(0 if sys.version_info >= (3, 11) else "Python 3.11 or later is needed, found " + sys.version.split()[0] + "; call make PYTHON=/path/to/python3.11")'
 	$(PYTHON) -m venv $(VENV)
 
-# Packages are compiled by all cores at once, where pip takes one; their own tests are left out.
+# Packages are compiled by all cores at once, where pip takes one; their own tests are left out, and large packages
+# that nearly no process imports.
+NOT_COMPILED := tests|debugpy|fontTools|huggingface_hub|mypy|mypyc|narwhals|networkx|pgmpy|pip|sklearn|sqlalchemy|statsmodels
 install = $(1)/bin/python -m pip install --quiet --disable-pip-version-check --no-compile --require-hashes -r $(2)
-compile = @$(1)/bin/python -m compileall -qq -j 0 -x '/tests/' $$($(1)/bin/python -c 'import sysconfig; print(sysconfig.get_path("purelib"))') || true
+install_project = $(BIN)/python -m pip install -qq --disable-pip-version-check --no-build-isolation --no-deps --editable .
+compile = @$(1)/bin/python -m compileall -qq -j 0 -x '/($(NOT_COMPILED))/' $$($(1)/bin/python -c 'import sysconfig; print(sysconfig.get_path("purelib"))') || true
 
 $(VENV)/.runtime: requirements.lock pyproject.toml | $(VENV)/bin/python
 	@echo "Installing the packages of requirements.lock into $(VENV): about a minute the first time."
 	$(call install,$(VENV),requirements.lock)
-	$(BIN)/python -m pip install -qq --disable-pip-version-check --no-build-isolation --no-deps --editable .
+	$(install_project)
 	$(call compile,$(VENV))
 	@touch $@
 
-$(VENV)/.dev: requirements-dev.lock $(VENV)/.runtime
+# The packages of requirements.lock are among these.
+$(VENV)/.dev: requirements-dev.lock requirements.lock pyproject.toml | $(VENV)/bin/python
+	@echo "Installing the packages of requirements-dev.lock into $(VENV): about a minute the first time."
 	$(call install,$(VENV),requirements-dev.lock)
+	$(install_project)
 	$(call compile,$(VENV))
-	@touch $@
+	@touch $(VENV)/.runtime $@
 
 # The site reads docstrings and runs notebooks, so its packages see those of development behind their own.
 $(DOCS_VENV)/.docs: requirements-docs.lock $(VENV)/.dev

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 
-from benchmarks.unlisted_laws.campaigns import drawn, write
+from benchmarks.unlisted_laws.campaigns import Experiment, drawn, write
 from benchmarks.unlisted_laws.rig import law_force
 from discrepancy.campaign.reading import read_campaign
 from discrepancy.catalogue.force_curve import CORRELATION_LENGTHS, curve_functions
@@ -17,14 +17,19 @@ from discrepancy.workflow import check_and_prepare, problem_without_wrong_ends
 from tests.discrepancy.rigs import chosen
 
 SEED = 5
-MAGNET = drawn("magnet", SEED)
 
 
 @pytest.fixture(scope="module")
-def search(tmp_path_factory: pytest.TempPathFactory) -> ForceSearch:
+def magnet() -> Experiment:
+    """Return a campaign on a mass beside a magnet."""
+    return drawn("magnet", SEED)
+
+
+@pytest.fixture(scope="module")
+def search(magnet: Experiment, tmp_path_factory: pytest.TempPathFactory) -> ForceSearch:
     """Return the search for the missing force of a mass beside a magnet."""
     folder = tmp_path_factory.mktemp("magnet")
-    write(folder, MAGNET, SEED)
+    write(folder, magnet, SEED)
     model = LumpedModel.load(folder / "model.toml")
     campaign, _ = check_and_prepare(read_campaign(folder), model)
     return ForceSearch(problem_without_wrong_ends(campaign, model))
@@ -48,11 +53,11 @@ def test_the_curve_leaves_no_force(ranked):
     assert not any(other.leaves_no_force for other in ranked[1:])
 
 
-def test_the_curve_is_that_of_the_magnet(search, ranked):
+def test_the_curve_is_that_of_the_magnet(magnet, search, ranked):
     """But for a line, which a small error of the stiffness adds."""
     (table,) = ranked[0].candidate.patch(search.ported.problem.setting, ranked[0].effect)
     displacements = np.array(table.displacements)
-    truth = np.array([law_force(MAGNET.truth, 0.0, x, 0.0, 0.0) for x in displacements])
+    truth = np.array([law_force(magnet.truth, 0.0, x, 0.0, 0.0) for x in displacements])
     difference = np.array(table.forces) - truth
     line = np.polyval(np.polyfit(displacements, difference, 1), displacements)
 
