@@ -96,25 +96,18 @@ def _output_rows(
     return np.array(output_rows)
 
 
-def ports_of_blocks(
-    trial: Trial, ports: Sequence[str], blocks: Iterable[LoadedSystem]
-) -> PortsAtRest:
+def ports_of_blocks(trial: Trial, blocks: Iterable[LoadedSystem]) -> PortsAtRest:
     """Return the ports in a trial at rest, without laws; a port of a state does not move.
 
-    Parameters
-    ----------
-    trial : Trial
-        The trial.
-    ports : sequence of str
-        The names of the ports.
-    blocks : iterable of LoadedSystem
-        The linear systems of all rows of the trial.
+    `blocks` are the linear systems of all rows of the trial.
     """
+    ports: tuple[str, ...] = ()
     positions: list[FloatArray] = []
     compliance: list[FloatArray] = []
     outputs_by_force: list[FloatArray] = []
     for block in blocks:
         system = block.system
+        ports = tuple(system.ports)
         port_rows = np.array([system.ports[name] for name in ports])
         port_rows[:, system.displacement_count :] = 0.0
         with errors_at_rest(trial):
@@ -124,4 +117,6 @@ def ports_of_blocks(
         row_count = len(positions[-1])
         compliance += [port_rows @ flexibility.T] * row_count
         outputs_by_force += [flexibility @ block.output_rows.T] * row_count
-    return PortsAtRest(np.concatenate(positions), np.array(compliance), np.array(outputs_by_force))
+    return PortsAtRest(
+        ports, np.concatenate(positions), np.array(compliance), np.array(outputs_by_force)
+    )

@@ -121,6 +121,8 @@ class PortsAtRest:
 
     Attributes
     ----------
+    ports : tuple of str
+        The names of the P ports: those of the model, and places of forces that are spread over it.
     positions : (N, P) ndarray
         The positions x of the P ports without these forces [m or rad]; 0 at a port of a state.
     compliance : (N, P, P) ndarray
@@ -129,6 +131,7 @@ class PortsAtRest:
         E: the outputs by a unit force at each port.
     """
 
+    ports: tuple[str, ...]
     positions: FloatArray
     compliance: FloatArray
     outputs_by_force: FloatArray
@@ -136,6 +139,7 @@ class PortsAtRest:
     def minus(self, other: "PortsAtRest") -> "PortsAtRest":
         """Return the difference to the ports under other conditions."""
         return PortsAtRest(
+            self.ports,
             self.positions - other.positions,
             self.compliance - other.compliance,
             self.outputs_by_force - other.outputs_by_force,
@@ -144,7 +148,10 @@ class PortsAtRest:
     def times(self, factor: float) -> "PortsAtRest":
         """Return all arrays times a factor."""
         return PortsAtRest(
-            factor * self.positions, factor * self.compliance, factor * self.outputs_by_force
+            self.ports,
+            factor * self.positions,
+            factor * self.compliance,
+            factor * self.outputs_by_force,
         )
 
 

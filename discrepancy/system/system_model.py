@@ -310,7 +310,7 @@ class SystemModel(Model):
     def _ports_at_rest(self, trial: Trial, outputs: Outputs, conditions: Conditions) -> PortsAtRest:
         """Return the ports in a trial at rest, without laws; a port of a state does not move."""
         case = self.patched_trial(trial, conditions, self.patch.in_trial(trial.name))
-        return ports_of_blocks(trial, self.ports, self._loaded_systems(case, outputs))
+        return ports_of_blocks(trial, self._loaded_systems(case, outputs))
 
     def _loaded_systems(self, case: PatchedTrial, outputs: Outputs) -> Iterator[LoadedSystem]:
         """Yield the linear system of a trial at rest, with loads and outputs, by block of rows."""

@@ -51,8 +51,6 @@ class TrialAtRest:
         divided by the noise deviations.
     local_precision : (L,) ndarray
         The prior precisions of the unknowns of this trial alone.
-    ports : tuple of str
-        The names of the ports.
     response : PortsAtRest
         The ports of the linear model at `linearisation_point`. The outputs contain the gains of the
         channels, and are divided by the noise.
@@ -72,7 +70,6 @@ class TrialAtRest:
     shared_derivatives: FloatArray
     local_derivatives: FloatArray
     local_precision: FloatArray
-    ports: tuple[str, ...]
     response: PortsAtRest
     response_derivatives: Mapping[int, PortsAtRest]
     linearisation_point: FloatArray
@@ -81,6 +78,11 @@ class TrialAtRest:
     is_at_rest = True
     stride = 1
     substeps = 1
+
+    @property
+    def ports(self) -> tuple[str, ...]:
+        """The names of the ports."""
+        return self.response.ports
 
     @property
     def fine_time(self) -> FloatArray:
@@ -247,7 +249,6 @@ def trial_at_rest(problem: Problem, trial_index: int, point: Point) -> TrialAtRe
         shared_derivatives=by_shared / deviation * trial.used,
         local_derivatives=by_local / deviation * trial.used,
         local_precision=data.unknowns.precision,
-        ports=tuple(problem.model.ports),
         response=_with_readings(response, readings_per_output),
         response_derivatives={
             number: _with_readings(derivative, readings_per_output)

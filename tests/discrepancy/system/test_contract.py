@@ -25,7 +25,15 @@ from discrepancy.system.system_state import SystemState
 from discrepancy.system.wing_model import WingModel
 from fe.runtime import patch
 from fe.runtime.laws import LAWS
-from fe.runtime.patch import PRIMITIVES, FreePlay, LoadPlace, PointMass, PowerDamping, PowerStiffness
+from fe.runtime.patch import (
+    PRIMITIVES,
+    FreePlay,
+    LoadPlace,
+    PointMass,
+    PowerDamping,
+    PowerStiffness,
+    TableStiffness,
+)
 from tests.discrepancy.rigs import INPUTS, FloatArray, asked, campaign, fmu_rig, seen
 from tests.refusals import refused
 
@@ -126,6 +134,19 @@ def stiffness_and_mass(kind: Kind) -> StiffnessAndMass:
     system = model.system_in_state(state)
     ports = {name: model.port_rows[name] for name in kind.ports}
     return StiffnessAndMass(system.stiffness, system.mass, model.force_row(kind.place, state), ports)
+
+
+@pytest.mark.parametrize("kind", ["lumped", "structure", "wing"], indirect=True)
+def test_a_force_at_a_port_at_rest_changes_the_outputs_as_a_law_of_constant_force(kind: Kind) -> None:
+    loads = kind.trial(TrialKind.STATIC, force=np.array([1.0, -2.0]))
+    outputs = ((kind.output, kind.model.output_quantity(kind.output)),)
+    at_rest = kind.model.ports_at_rest(loads, outputs, Conditions(kind.model.prior_mean()))
+    for number, port in enumerate(at_rest.ports):
+        if port not in kind.model.ports:
+            continue  # one of the stations of a force that is spread
+        constant_force = TableStiffness(port=port, displacements=(-1.0, 1.0), forces=(0.5, 0.5))
+        change = kind.seen(loads, constant_force) - kind.seen(loads)
+        np.testing.assert_allclose(change, -0.5 * at_rest.outputs_by_force[:, number], rtol=1e-7, atol=1e-15)
 
 
 LARGEST_FORCE = 6.0
