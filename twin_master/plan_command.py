@@ -233,8 +233,8 @@ def _check_names(scenario: "Scenario", names: Sequence[str]) -> None:
         if name not in (*titles, *inspecting):
             actions = comma_list(inspecting or ["there is none"])
             raise MissionInputError(
-                f"--value-of names an action that inspects ({actions}) or a gauge ({titles[0]} to "
-                f"{titles[-1]}), but `{name}` was given."
+                f"--value-of must name an action that inspects ({actions}) or a gauge ({titles[0]} "
+                f"to {titles[-1]}), but `{name}` was given."
             )
 
 
@@ -341,8 +341,8 @@ def _candidate_titles(titles: Sequence[str], among: str | None) -> Sequence[str]
     are_different = len({*candidates}) == len(candidates)
     if not are_known or not are_different:
         raise MissionInputError(
-            f"--among names different sensors ({titles[0]} to {titles[-1]}), but `{among}` was "
-            "given."
+            f"--among must name different sensors, from {titles[0]} to {titles[-1]}, but `{among}` "
+            "was given."
         )
     return candidates
 

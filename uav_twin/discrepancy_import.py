@@ -274,8 +274,8 @@ def _check_folder(folder: Path, *, replace_it: bool) -> None:
     other_names = [name for name in names if not _FILE_OF_IMPORT.fullmatch(name)]
     if other_names:
         raise FileNotWrittenError(
-            f"{folder} is not the folder of an earlier import alone ({sorted(other_names)[0]}), "
-            "and was left unchanged: choose another --out."
+            f"{folder} was left unchanged, because it also holds {sorted(other_names)[0]}, which "
+            "is not of an earlier import: choose another --out."
         )
 
 

@@ -252,8 +252,8 @@ class Calibration:
             is_complete = len(samples) > 0 and samples.shape[1:] == (len(self.all_quantities),)
             if not is_complete or not np.isfinite(samples).all():
                 raise CalibrationRecordError(
-                    f"the calibration of {self.asset} must have samples of posterior and prior, "
-                    "finite ones, of each of its quantities."
+                    f"the calibration of {self.asset} must have finite samples of posterior and "
+                    "prior for each of its quantities."
                 )
 
     @property

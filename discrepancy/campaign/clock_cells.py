@@ -237,8 +237,8 @@ def join_dates_with_times(
         titles_of_both = [titles[index] for index in sorted([*date_columns, *time_columns])]
         raise CampaignFileError(
             f"{places[0]}: which dates belong to which times is not clear among the columns "
-            f"{listing(map(repr, titles_of_both))}: leave one column of dates, or one for each of "
-            "times."
+            f"{listing(map(repr, titles_of_both))}: leave one column of dates for all, or one for "
+            "each column of times."
         )
     dates_of_times = date_columns
     if len(date_columns) == 1:

@@ -161,8 +161,8 @@ class Event:
         subject = f"the event {self.name!r}"
         if not self.name.isidentifier():
             raise CampaignFileError(
-                f"{subject} is used in expressions, so its name must be of letters, digits and "
-                "underscores, a letter first"
+                f"{subject} is used in expressions, so its name must consist of letters, digits "
+                "and underscores, and begin with a letter"
             )
         if self.name in RESERVED or iskeyword(self.name):
             raise CampaignFileError(

@@ -242,8 +242,8 @@ def _noise_interval(campaign: records.Campaign) -> float | None:
         return None
     if len(intervals) > 1 or None in intervals:
         raise CampaignFileError(
-            "Noise records can be written only if all have one sampling interval: resample them, "
-            "or keep their standard deviations."
+            "Noise records can be written only if all have the same sampling interval: resample "
+            "them, or keep their standard deviations."
         )
     return intervals.pop()
 

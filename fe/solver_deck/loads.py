@@ -182,8 +182,8 @@ def _gravity(model: LinearModel, where: str, values: Sequence[str]) -> FloatArra
     missing = set(model.mesh.elements) - elements
     if missing:
         raise NotReadError(
-            f"gravity on some elements is left out: {values[0]} lacks {len(missing)} of "
-            f"{len(model.mesh.elements)}; let it act on all"
+            f"gravity is left out, because it does not act on all elements: {values[0]} lacks "
+            f"{len(missing)} of {len(model.mesh.elements)}; let it act on all"
         )
     axis = np.array(direction)
     if not axis.any():

@@ -189,8 +189,8 @@ class _SystemReader:
             if not path and kind not in CONNECTOR_KINDS:
                 raise package_error(
                     self.package,
-                    f"the connector {end.variable!r} of the system is of the kind {kind}, not "
-                    "supported.",
+                    f"the connector {end.variable!r} of the system is of the kind {kind}, "
+                    "which is not supported.",
                 )
             type_element = connector.find("ssc:*", NAMESPACES)
             if type_element is None:

@@ -442,7 +442,7 @@ class FmuSource(AssetSource):
         count = positions.stop - positions.start
         if count != expected_count:
             raise MissionInputError(
-                f"the binding {binding.name} observes {count} values of `{role}`, and the scenario "
+                f"the binding {binding.name} observes {count} values of `{role}`, but the scenario "
                 f"expects {expected_count}."
             )
         return positions

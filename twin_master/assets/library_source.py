@@ -174,7 +174,7 @@ class ObservationLibrary:
         if set(values) != set(self.control_values):
             raise MissionInputError(
                 "the observation library has the control inputs "
-                f"{comma_list(self.control_values)}, and the scenario sets {comma_list(values)}: "
+                f"{comma_list(self.control_values)}, but the scenario sets {comma_list(values)}: "
                 f"{_ADVICE}"
             )
         # One truth value for each of the U sampled controls.
@@ -244,7 +244,7 @@ class ObservationLibrary:
         tolerance = _RELATIVE_TOLERANCE * float(np.abs(nodes).max())
         if draws.min() < nodes[0] - tolerance or draws.max() > nodes[-1] + tolerance:
             raise MissionInputError(
-                f"the draws of {name} reach from {draws.min():.6g} to {draws.max():.6g}, and the "
+                f"the draws of {name} reach from {draws.min():.6g} to {draws.max():.6g}, but the "
                 f"observation library from {nodes[0]:.6g} to {nodes[-1]:.6g}: sample one for this "
                 f"scenario and seed, or over a wider range with --grid parameter.{name}=..."
             )
@@ -337,7 +337,7 @@ class LibraryBelief(BeliefSection):
         """
         if not isinstance(flown_source, FmuSource):
             raise MissionInputError(
-                "an observation library was sampled from an FMU, and the kind of the asset is "
+                "an observation library is sampled from an FMU, but the kind of the asset is "
                 f"`{scenario.asset.kind}`: set `belief.kind` to `asset` or `design`."
             )
         return LibrarySource(scenario, self, flown_source)
@@ -417,7 +417,7 @@ class LibrarySource(AssetSource):
         if list(library_labels) != list(scenario_labels):
             raise MissionInputError(
                 f"the observation library {self.path(OBSERVATIONS_COPY).name} {verb} "
-                f"{', '.join(library_labels) or 'none'}, and the scenario with its binding asks "
+                f"{', '.join(library_labels) or 'none'}, but the scenario with its binding asks "
                 f"for {', '.join(scenario_labels) or 'none'}: {_ADVICE}"
             )
 

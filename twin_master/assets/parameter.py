@@ -98,7 +98,7 @@ def draw_parameter(
         return _draws_of_load_test(calibration, seed, None)
     if model is None:
         raise MissionInputError(
-            "`calibration.curve` asks for the stiffness curve of a design, and the asset has none: "
+            "`calibration.curve` asks for the stiffness curve of a design, but the asset has none: "
             "let the twin believe a `design`, or set `calibration.curve` to `published`."
         )
     return _draws_of_load_test(calibration, seed, model)

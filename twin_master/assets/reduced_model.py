@@ -230,7 +230,7 @@ class StructureOfFile(AssetSource):
             )
         if observation.count != counts[role]:
             raise MissionInputError(
-                f"{self.full_name} has {counts[role]} sensors of `{role}`, and the scenario "
+                f"{self.full_name} has {counts[role]} sensors of `{role}`, but the scenario "
                 f"expects {observation.count}."
             )
         # Titles that are the names of the sensors in another order would name the wrong ones.

@@ -191,7 +191,7 @@ def _check_asset_overrides(asset: Table, overrides: Overrides, file_count: int) 
         )
     if overrides.fmu and asset["kind"] in ("coupled", "ssp"):
         raise MissionInputError(
-            "--fmu flies one FMU, and the scenario couples several: change its components."
+            "--fmu replaces one FMU, but the scenario couples several: change its components."
         )
     if file_count and asset.get("patch"):
         raise MissionInputError(
@@ -398,7 +398,7 @@ def _check_learnt_transition(table: JsonRecord, transition: JsonRecord, path: Pa
     kind = table["transition"]["kind"]
     if sorted(learnt_controls) != controls or kind != "independent_worsening":
         raise MissionInputError(
-            f"{path} has probabilities for {comma_list(learnt_controls)}, and the scenario has the "
+            f"{path} has probabilities for {comma_list(learnt_controls)}, but the scenario has the "
             f"controls {comma_list(controls)} and transitions of the kind {kind}."
         )
 

@@ -275,7 +275,7 @@ class StrainLibrarySource(AssetSource):
         if not has_same_gauges or scenario.state_names != library.states.names:
             raise MissionInputError(
                 f"the strain library has {library.gauge_count} gauges and the states "
-                f"{comma_list(library.states.names)}, and the scenario asks for "
+                f"{comma_list(library.states.names)}, but the scenario asks for "
                 f"{scenario.observation.count} and {comma_list(scenario.state_names)}."
             )
 
@@ -347,7 +347,7 @@ def _source_of_file(scenario: Scenario, path: Path) -> StrainLibrarySource:
             if abs(load_factor - library_load_factor) > _LOAD_FACTOR_TOLERANCE:
                 raise MissionInputError(
                     f"the strain library flies the control {control.name} at load factor "
-                    f"{library_load_factor:g}, and the scenario gives the model of the design "
+                    f"{library_load_factor:g}, but the scenario gives the model of the design "
                     f"{load_factor:g}: set `load_factor` to {library_load_factor:g}."
                 )
     return StrainLibrarySource(scenario, load_strain_library(path), path)

@@ -129,8 +129,10 @@ def _address_error(address: str) -> MissionInputError:
 
 def _check_certificate(authority: Path, *, tls: bool) -> None:
     """Raise an error if a certificate is no readable file, or is given without `mqtts://`."""
-    if not tls or not authority.is_file():
-        raise MissionInputError(f"the certificate {authority} is a file, and belongs to mqtts://.")
+    if not tls:
+        raise MissionInputError(f"the certificate {authority} needs an address with mqtts://.")
+    if not authority.is_file():
+        raise MissionInputError(f"there is no file {authority} with a certificate.")
     with MissionInputError.instead_of(
         OSError, before=f"{authority} holds no certificate: ", after="."
     ):

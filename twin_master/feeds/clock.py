@@ -179,7 +179,7 @@ class Clock:
         """
         if self._step_length is None:
             raise Refused(
-                "it has a time and no step, and the scenario has no `watch.seconds_per_step`"
+                "it has a time and no step, but the scenario has no `watch.seconds_per_step`"
             )
         if not self._stretches:
             if self._counts_steps and time != next_step:

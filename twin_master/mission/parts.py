@@ -184,7 +184,7 @@ class TwinParts:
         if part.mean.shape != expected_shape:
             raise MissionInputError(
                 f"the sensor model {description(part)} is for (states, controls, sensors) = "
-                f"{part.mean.shape}, and the scenario has {expected_shape}: make it of "
+                f"{part.mean.shape}, but the scenario has {expected_shape}: make it of "
                 "`sensor_model.value_per_draw` of `uav_twin.prepare_twin`."
             )
         return part
@@ -219,7 +219,7 @@ class TwinParts:
         states = part.model.states.size  # type: ignore[union-attr]
         if states != twin.model.states.size:
             raise MissionInputError(
-                f"the estimator {description(part)} is for {states} states, and the scenario has "
+                f"the estimator {description(part)} is for {states} states, but the scenario has "
                 f"{twin.model.states.size}: make it of the model of `uav_twin.prepare_twin`."
             )
         return part  # type: ignore[return-value]

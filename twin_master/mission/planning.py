@@ -182,7 +182,7 @@ def read_policy(path: Path, model: GraphicalModel) -> Float | BeliefPolicy:
     state_count = policy.vectors.shape[1]
     if controls != model.controls or state_count != model.states.size:
         raise PlanningError(
-            f"{path} is for {state_count} states and the controls {comma_list(controls)}, and the "
+            f"{path} is for {state_count} states and the controls {comma_list(controls)}, but the "
             f"scenario has {model.states.size} and {comma_list(model.controls)}: plan it anew"
         )
     return policy

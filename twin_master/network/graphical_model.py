@@ -439,9 +439,8 @@ def leaving_table(table: Float, factor: float) -> Float:
     if np.any(staying < 0.0):
         leaving = 1.0 - float(staying.min())
         raise InvalidModelError(
-            f"a factor of {factor:g} on the transition probabilities makes the probability to "
-            f"leave a level {leaving:g}, and at most 1 is possible: take smaller "
-            "`learning.transition_factors`"
+            f"a factor of {factor:g} on the transition probabilities is too large: the probability "
+            f"of leaving a level would be {leaving:g}. Take smaller `learning.transition_factors`"
         )
     return np.asarray(result + np.diag(staying), dtype=np.float64)
 

@@ -300,8 +300,8 @@ class TransitionModel:
         are_square = all(_is_square(shape) for shapes in distinct_shapes for shape in shapes)
         if not (have_same_shapes and have_factors and are_square):
             raise InvalidModelError(
-                "expected for every control a square table for each factor, of the same states, "
-                f"got shapes {sorted(distinct_shapes)}"
+                "every control needs one square table for each factor, of the same size under all "
+                f"controls, but the tables have the shapes {sorted(distinct_shapes)}"
             )
 
         tables_by_factor = zip(*tables_by_control, strict=True)

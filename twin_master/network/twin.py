@@ -258,7 +258,7 @@ class Twin:
         require_one_of(decide_on, get_args(DecisionBasis), "decide_on")
         if lag is not None and lag < 0:
             raise InvalidModelError(
-                f"expected a lag of 0 or more steps, or None for all, got {lag}"
+                f"the lag must be 0 or more steps, or None for all steps, but {lag} was given"
             )
         self.name = name
         self.sensor_model = sensor_model

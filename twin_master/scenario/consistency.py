@@ -253,13 +253,13 @@ class ScenarioTables(Section):
         if truth.kind == "asset":
             yield (
                 not self.asset.is_fmu,
-                "`truth.kind` `asset` needs an FMU, and the kind of the asset is "
+                "`truth.kind` `asset` needs an FMU, but the kind of the asset is "
                 f"`{self.asset.kind}`",
             )
             yield incomplete_table_check(truth.state, self.state_names, "truth.state", "state")
         yield (
             truth.kind == "random_growth" and truth.gains,
-            "`truth.gains` belongs to the kind `scripted`, and the kind is `random_growth`",
+            "`truth.gains` belongs to the kind `scripted`, but the kind is `random_growth`",
         )
         for gain in truth.gains:
             yield unknown_name_check(gain.state, self.state_names, "truth.gains.state", "state")

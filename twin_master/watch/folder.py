@@ -449,7 +449,7 @@ class Watch:
         steps = self.twin.steps
         if not steps or not 0 <= patch.from_step <= steps:
             raise MissionInputError(
-                f"--from-step names one of the {steps} steps watched so far, or the next one."
+                f"--from-step must be one of the {steps} steps watched so far, or the next one."
             )
         outcome = self.trial_of(patch.file, patch.from_step)(progress=self.progress)
         self.adopt(outcome, None, self._copy_verdict_of(patch.file))

@@ -295,7 +295,7 @@ def test_a_calibration_needs_a_printable_name(calibration, name):
     ids=["not a number", "empty"],
 )
 def test_a_calibration_needs_finite_samples(calibration, change):
-    with pytest.raises(CalibrationRecordError, match="finite ones"):
+    with pytest.raises(CalibrationRecordError, match="finite samples"):
         replace(calibration, **change)
 
 

@@ -466,7 +466,7 @@ def test_what_cannot_be_written_says_so(tmp_path):
     other = replace(
         campaign.channels["tip"], noise=NoiseRecord(1.0, 9.0, np.arange(-5.0, 6.0), 0.5, "pre-trigger")
     )
-    with pytest.raises(CampaignFileError, match="one sampling interval"):
+    with pytest.raises(CampaignFileError, match="the same sampling interval"):
         write_campaign(replace(campaign, channels={**campaign.channels, "tip": other}), tmp_path / "b")
     warmer = (replace(campaign.trials[0], temperature=np.ones_like(campaign.trials[0].temperature)),)
     with pytest.raises(CampaignFileError, match="reference_temperature"):

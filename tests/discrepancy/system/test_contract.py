@@ -283,7 +283,7 @@ OF_ALL = [
         *((name, *row) for name in TABLE["kind"] for row in OF_ALL),
         ("lumped", TrialKind.FLIGHT, {}, (), "is a flight, but the model .* no input load_factor"),
         ("lumped", TrialKind.STATIC, {"load_place": (0.1, 0.2)}, (), "takes forces at"),
-        ("lumped", TrialKind.STATIC, {}, (patch.PortLoad("end", "time"),), "has no time, which a law"),
+        ("lumped", TrialKind.STATIC, {}, (patch.PortLoad("end", "time"),), "has no times, but a law"),
         ("lumped", TrialKind.STATIC, {}, (patch.Washout(0.1, 1.0),), "cannot carry the primitive 'washout'"),
         ("lumped", TrialKind.STATIC, {"load_place": "middle"}, (LoadPlace(0.1, 0.0),), "no station_deriv"),
         ("lumped", TrialKind.STATIC, {}, (PowerStiffness("end", -900.0, 3.0, 0, 1e-3),), "not found"),

@@ -464,7 +464,7 @@ def test_an_fmi_3_asset_with_an_array_is_watched(foreign_fmu, tmp_path):
     assert truth["state_calls"].values.tolist() == [1.0, 2.0, 3.0]
     assert (truth["y[1]"].attrs["units"], truth["y"].attrs["units"]) == ("mm", "m")
     np.testing.assert_allclose(truth["y"].values[:, 1], 1e-3 * truth["y[2]"].values, rtol=1e-6)
-    with pytest.raises(Exception, match=r"observes 2 values of `y`, and the scenario expects 3"):
+    with pytest.raises(Exception, match=r"observes 2 values of `y`, but the scenario expects 3"):
         new_run(three, tmp_path / "other")
     assert not (tmp_path / "other").exists()
 

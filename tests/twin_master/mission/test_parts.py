@@ -130,7 +130,7 @@ def test_a_part_that_does_not_fit_is_refused(role, name, sentence, fly, module):
 
 def test_a_sensor_model_of_other_states_is_refused(fly):
     other = uav_twin.GaussianSensorModel(np.ones((1, 2, 2, 24)), 1.0)
-    with pytest.raises(MissionInputError, match=r"\(2, 2, 24\), and the scenario has \(25, 2, 24\)"):
+    with pytest.raises(MissionInputError, match=r"\(2, 2, 24\), but the scenario has \(25, 2, 24\)"):
         fly("never", sensor_model=other)
 
 

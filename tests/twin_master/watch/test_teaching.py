@@ -196,7 +196,7 @@ class PatchedWatch:
         self.first_means_before = self.flight.beliefs_in(first_steps).expected.mean
         self.number_before = self.flight.number
         self.drawings_before = [*self.flight.drawings]
-        with pytest.raises(MissionInputError, match="--from-step names one of the 20 steps"):
+        with pytest.raises(MissionInputError, match="--from-step must be one of the 20 steps"):
             self.watch.run(feed, str, patch=GivenPatch(verdict / "patch.json", 21))
         given = GivenPatch(verdict / "patch.json", 15)
         counts = self.watch.run(feed, str, step_limit=25, patch=given)
