@@ -286,8 +286,7 @@ class SystemModel(Model):
         trial = case.trial
         if laws.active_spans or len(case.patch.of(PortLoad)):
             raise ModelError(
-                f"The trial {trial.name!r} has no times, but a law or a force that depends on "
-                "time needs them."
+                f"The trial {trial.name!r} has no times, but a law or force in time needs them."
             )
         values = np.empty((len(trial.force), len(outputs)))
         # what the laws remember of the loading, and the last load level, from one block to the next
