@@ -137,7 +137,10 @@ def log_likelihood(
     measure: Measure = "displacement",
     zero_offset_standard_deviation: float = 0.0,
 ) -> Float:
-    """Return the log likelihood (N,) of all pairs at values of e.
+    """Return the log likelihood (N,) of all pairs of load and displacement at N values of e.
+
+    The pairs are independent, but for an offset of the displacement's zero that the pairs of a
+    loading run have in common.
 
     Parameters
     ----------

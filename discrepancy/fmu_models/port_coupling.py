@@ -88,9 +88,9 @@ class PortCoupling:
     ) -> FloatArray:
         """Return the speed (P,) that the laws take from the ports during the next step.
 
-        The step is integrated with the laws, and the speed at its end is subtracted from the speed
-        that the ports would have without them. The memory of the laws is advanced by the step, so
-        that each step needs exactly one call.
+        This is the speed that the ports would have at its end without the laws, minus that with
+        them, by which a step of the FMU is corrected. The memory of the laws is advanced by the
+        step, so that each step needs exactly one call.
 
         Parameters
         ----------

@@ -20,7 +20,7 @@ def campaign_in_names_of(campaign: Campaign, model: Model) -> Campaign:
 
 
 def _trial_in_names_of(trial: Trial, model: Model) -> Trial:
-    """Return a trial with the load place and the damage regions of a model.
+    """Return a trial whose load place and damage regions are named as in a model.
 
     The default load place becomes the model's own, if the model has only one. Regions of the model
     that the trial does not have get no loss. A region that the model does not have is dropped,

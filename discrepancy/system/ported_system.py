@@ -77,11 +77,11 @@ def ported_system(
 def _direct_forces(
     system: LinearSystem, equations: Sequence[OutputEquation], directions: FloatArray
 ) -> FloatArray:
-    """Return the immediate change (P, C) of each output by a unit force at each port.
+    """Return the change (P, C) of each output at the instant at which a unit force acts at a port.
 
-    `directions` (P, N) are those in which the forces act. A force adds to the output that is the
-    force of a prescribed motion, and it deforms modes without inertia at once. Other outputs do not
-    change.
+    `directions` (P, N) are those in which the forces act. An output that is the force needed for a
+    prescribed motion changes by the force itself. If modes are truncated, the force deforms those
+    without inertia at once, which changes displacements. All other changes are zero.
     """
     direct_forces = np.zeros((len(directions), len(equations)))
     for column, equation in enumerate(equations):

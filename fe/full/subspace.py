@@ -124,7 +124,11 @@ class OrthonormalBasis:
         self._drop = drop
 
     def extend(self, block: FloatArray) -> FloatArray:
-        """Add vectors (n, m) to the basis; return their coordinates (k, m) in it."""
+        """Add vectors (n, m) to the orthonormal basis, and return their coordinates (k, m) in it.
+
+        Directions whose length outside the basis is negligible, relative to the vectors, are not
+        added; `dropped_square` sums up what is lost by this.
+        """
         length = np.linalg.norm(block, axis=0)
         divisor = np.where(length > 0.0, length, 1.0)
         outside = block / divisor

@@ -29,7 +29,7 @@ def built_once(
     build: Callable[[], Result],
     keep: Callable[[Result], object],
 ) -> Result:
-    """Load a result from its file, or build it and write the file.
+    """Return a result from its file, or build it and write the file.
 
     If several processes need the same result, one builds it and the others wait.
 

@@ -59,7 +59,10 @@ def port_acceleration(
     applied: FloatArray,
     time: float,
 ) -> float:
-    """Return the acceleration of the port of law `j`.
+    """Return the acceleration of the port of law `j`, from the forces on all modes.
+
+    The modes are mass-normalised, so that the acceleration of a mode is its applied force minus
+    those of stiffness, damping and laws. The port moves by its motion row times the modes.
 
     Parameters
     ----------

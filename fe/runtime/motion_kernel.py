@@ -144,7 +144,12 @@ def first_half_impulse(
     state: ModalState,
     h: float,
 ) -> None:
-    """Give the modes the first half of the laws' impulse in step `k` of duration `h` [s]."""
+    """Change the modal speeds by the laws' impulse in the first half of step `k`, of `h` [s].
+
+    A step is split: half the impulse of the laws, then the linear structure alone (`linear_step`),
+    then the other half (`second_half_impulse`). Laws of speed act on their ports one after the
+    other, each by its closed solution; the forces of laws of position are those at the start.
+    """
     half = 0.5 * h
     mode_count = len(state.q)
     law_count = len(ports.law_number)
@@ -198,7 +203,11 @@ def add_stiffness_drift(steps: StepArrays, state: ModalState, duration_times_cha
 def linear_step(
     steps: StepArrays, k: int, state: ModalState, new_state: FloatArray, coupled: bool
 ) -> None:
-    """Advance the linear structure exactly by step `k`; uncoupled modes each by itself."""
+    """Advance modal coordinates and speeds by step `k` of the linear structure, without laws.
+
+    The step is exact: the transition matrix times coordinates and speeds, plus the increment by the
+    loads. If the modes are not `coupled`, each depends on itself alone. `new_state` is work space.
+    """
     mode_count = len(state.q)
     transition = steps.transition[steps.length_of_step[k]]
     for m in range(mode_count):
@@ -285,9 +294,10 @@ def second_half_impulse(
     state: ModalState,
     h: float,
 ) -> None:
-    """Give the modes the second half of the impulse of laws of speed, in step `k` of `h` [s].
+    """Change the modal speeds by the impulse of laws of speed in the second half of step `k`.
 
-    If the friction at a port has reversed within the step, its impulse is corrected.
+    The duration of the step is `h` [s]. If the friction at a port has reversed within the step, its
+    impulse is corrected. A port at which the friction can hold the speed at zero sticks.
     """
     half = 0.5 * h
     if ports.stiffness_rate != 0.0:

@@ -151,7 +151,11 @@ def _limit_this_process() -> None:
 
 
 def _start_worker(twin: _Twin, scratch: str, fmu_folder: str, grants: str, report: str) -> _Worker:
-    """Fork the worker from this process and return it; arguments as for `supervise`."""
+    """Fork the worker from this process, and return its number and descriptor.
+
+    The worker has a process group of its own, and dies with the supervisor. The arguments are those
+    of `supervise`.
+    """
     supervisor = os.getpid()
     number = os.fork()
     if number == 0:

@@ -108,7 +108,7 @@ def fly_pieces(
 def _fly_by_workers(
     client: "Client", pieces: Iterator[Piece]
 ) -> Iterator[tuple[Piece, ShardResult]]:
-    """Fly pieces by workers.
+    """Fly the pieces of a fleet by Dask workers; yield each with its result when it has flown.
 
     If more than `ALLOWED_DEATHS` workers died while flying a piece, its twins are flown one by one.
     A single twin with as many deaths is returned as failed.

@@ -166,9 +166,10 @@ def weigh_gauge_fault_in_logs(
 
 @compiled
 def _densities_of_faults(priors: FaultPriors, beliefs: Beliefs, twin: int) -> GaugeDensities:
-    """Return the densities of the faulty gauges of a twin before an observation.
+    """Return the predictive density of the gauge's reading under each fault of a twin's gauges.
 
-    A gain is kept within one prior standard deviation of the gain error.
+    Each gauge has `GAINS_PER_SENSOR` faults, one around each gain error. The gain is that of the
+    regression so far, kept within one prior standard deviation of the gain error.
     """
     count = beliefs.gauge.shape[2]
     faults = GaugeDensities(

@@ -109,6 +109,10 @@ class StandstillTest:
     ) -> StuckGauges:
         """Return the state after the readings of a step.
 
+        A gauge that repeats its last reading gains evidence of being stuck: a sound gauge repeats
+        it only with a probability, which is estimated from the readings so far. One reading that
+        has moved rules the fault out.
+
         Parameters
         ----------
         gauges : StuckGauges

@@ -150,7 +150,12 @@ class BoucWen(PortForce):
 
 
 def hysteretic_displacement(law: FloatArray, memory: FloatArray, x: float) -> float:
-    """Return z of a Bouc-Wen law at `x`, reached from the last position in a straight line."""
+    """Return the hysteretic displacement z of a Bouc-Wen law at the position `x`.
+
+    The memory has the last position and z there; the position changes from it in one direction. z
+    is the stretch of a spring that yields gradually: it follows the motion on unloading, and tends
+    to the yield displacement on loading.
+    """
     yield_displacement = law[1]
     order = law[2]
     # all displacements in units of the yield displacement

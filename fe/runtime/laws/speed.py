@@ -27,8 +27,10 @@ def force_of_mean_speed(
 ) -> tuple[float, float]:
     """Return the force of a law of speed at `x`, and its derivative by `x`.
 
-    The speed is the mean speed since the last position, (x - last position) / duration. Dry
-    friction returns its largest force, with the sign for a forward motion.
+    The speed is the mean speed since the last position, (x - last position) / duration. The force
+    is coefficient |x|^a |speed - level|^p with the sign of speed - level, or from a table of the
+    speed; a one-sided law has no force below the level. Dry friction (p = 0) returns its largest
+    force, with the sign for a forward motion.
     """
     exponent = law[EXPONENT]
     if law[ONE_SIDED] == TABLE:
