@@ -196,7 +196,7 @@ def _forces_of_table(
     for number, point in enumerate(table.points[::POINT_STRIDE].tolist()):
         estimates.append(
             ParameterEstimate(
-                name=f"force_at_{point:.3g}",
+                name=f"force_at_{point:.3g}_{unit}",
                 value=float(forces[number]),
                 low=float(low[number]),
                 high=float(high[number]),

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
-from scipy.special import logsumexp
+from scipy.special import entr, logsumexp
 
 from discrepancy.campaign.records import FloatArray, Trial, TrialKind
 from discrepancy.errors import SENTENCES, DiscrepancyError
@@ -76,19 +76,22 @@ def next_experiments(
     """Return the experiments that best separate the open hypotheses, to propose them to the user.
 
     An experiment is a feasible trial that tells at least `LEAST_INFORMATION`, and `LEAST_SHARE` of
-    what is not known yet. At most `MOST_PROPOSED` are returned, those of the largest information
-    per cost first.
+    what is not known yet. None is needed if less than `LEAST_INFORMATION` is open. At most
+    `MOST_PROPOSED` are returned, those of the largest information per cost first.
 
     Parameters
     ----------
     open_fits : sequence of (CandidateFit, float)
         The hypotheses that are still open with their probabilities, the most probable first.
     """
-    # a hypothesis of nearly no probability would make its logarithm infinite
-    probabilities = np.array([max(probability, LEAST_PROBABILITY) for _, probability in open_fits])
-    probabilities /= probabilities.sum()
-    entropy = -float(probabilities @ np.log(probabilities))
+    given_probabilities = np.array([probability for _, probability in open_fits])
+    entropy = float(np.sum(entr(given_probabilities / given_probabilities.sum())))
+    if entropy < LEAST_INFORMATION:
+        return ()  # hardly anything is open
     least_information = max(LEAST_INFORMATION, LEAST_SHARE * entropy)
+    # a hypothesis of nearly no probability would make its logarithm infinite
+    probabilities = np.maximum(given_probabilities, LEAST_PROBABILITY)
+    probabilities /= probabilities.sum()
     fits = [fit for fit, _ in open_fits]
     is_oscillating = oscillates(problem, fits[0]) if fits else True
     experiments = []
