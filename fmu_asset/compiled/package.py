@@ -131,6 +131,9 @@ def exchange_table(
 DATA_FILE = "resources/reduced_model.bin"
 """The name of the data file in the archive."""
 
+VARIABLE_SOURCES = ("structure_variables.h", "structure_variables.c")
+"""The generated sources, which differ between FMUs."""
+
 _TIME = FmuVariable("time", 0, "Real", "independent", "continuous", "Time", unit="s")
 
 HOST = "It is compiled C and needs nothing but the C library; its sources are inside."
@@ -233,8 +236,7 @@ def variable_sources(
         "categories": description.LOG_CATEGORIES,
         "enumerations": ENUMERATIONS,
     }
-    names = ("structure_variables.h", "structure_variables.c")
-    return {name: description.rendered(name, **values) for name in names}
+    return {name: description.rendered(name, **values) for name in VARIABLE_SOURCES}
 
 
 def _common_sources(fmi: FmiVersion) -> dict[str, bytes]:
@@ -299,7 +301,8 @@ def compiled_binaries(
         if name.startswith("sources/"):
             sources[name.removeprefix("sources/")] = content
     if platforms is None:
-        return {host_binary_name(identifier, fmi): compile_library(sources)}
+        library = compile_library(sources, generated=VARIABLE_SOURCES)
+        return {host_binary_name(identifier, fmi): library}
     binaries = {}
     for folder, targets in targets_by_folder(platforms, fmi).items():
         name = binary_name(folder, targets[0], identifier)

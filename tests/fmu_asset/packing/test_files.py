@@ -1,5 +1,6 @@
 """Our FMUs as files: sound, equal for equal input, guarded, refused in one sentence."""
 
+import ctypes
 import json
 import os
 import re
@@ -119,6 +120,7 @@ def test_equal_input_gives_equal_bytes(ours, name, tmp_path, monkeypatch):
     target = tmp_path / "again.fmu"
 
     if name in STRUCTURES:
+        monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "no object code"))
         same_model = ReducedModel.from_bytes(ours.model(name).to_bytes())
         build_fmu(same_model, target, **ours.options(name))
     else:
@@ -507,6 +509,47 @@ def test_a_compiler_that_writes_nothing_has_failed(compiler, monkeypatch):
 
     with pytest.raises(errors.FmuBuildError, match="failed with exit code 0"):
         compile_library({"wing.c": b"int wing;\n"})
+
+
+def test_object_code_that_fmus_share_is_compiled_once(compiler, tmp_path, monkeypatch):
+    """Until the compiler's options or one of its files changes, and of the same bytes."""
+    calls = tmp_path / "calls"
+    program = tmp_path / "cc"
+    program.write_text(
+        f'#!/bin/sh\necho "$*" >> "{calls}"\nexec {compiler[0]} "$@"\n', encoding="utf-8"
+    )
+    program.chmod(0o755)
+    monkeypatch.setenv("CC", str(program))
+    exported = '__attribute__((visibility("default")))'
+
+    def answer_and_whether_compiled(
+        cache: str, own: int, shared: int = 40
+    ) -> tuple[bytes, int, bool]:
+        texts = {
+            "shared.c": '#include "shared.h"\nint shared(void) { return SHARED; }\n',
+            "shared.h": f"#define SHARED {shared}\nint shared(void);\n",
+            "caller.c": f'#include "caller.h"\n{exported} int answer(void) {{ return OWN; }}\n',
+            "caller.h": '#include "shared.h"\n#include "own.h"\n',
+            "own.h": f"#define OWN (shared() + {own})\n",
+        }
+        sources = {name: text.encode() for name, text in texts.items()}
+        calls.write_text("", encoding="utf-8")
+        monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / cache))
+        library = compile_library(sources, generated=["own.h"])
+        file = tmp_path / f"{cache}-{own}-{shared}.so"
+        file.write_bytes(library)
+        compiled = "shared.c" in calls.read_text("utf-8")
+        assert "caller.c" in calls.read_text("utf-8")
+        return library, ctypes.CDLL(str(file)).answer(), compiled
+
+    library, *first = answer_and_whether_compiled("cache", 2)
+    assert first == [42, True]
+    assert answer_and_whether_compiled("cache", 3)[1:] == (43, False)
+    assert answer_and_whether_compiled("cache", 2, shared=50)[1:] == (52, True)
+    monkeypatch.setenv("CC", f"{program} -DOTHER")
+    assert answer_and_whether_compiled("cache", 4)[1:] == (44, True)
+    monkeypatch.setenv("CC", str(program))
+    assert answer_and_whether_compiled("another cache", 2) == (library, 42, True)
 
 
 def test_a_chosen_compiler_that_is_not_there_is_named(monkeypatch):
