@@ -395,6 +395,7 @@ def amplitude_dependence(fit: RingDownFit) -> tuple[RingDownMode, ...]:
         )
         window_fit = model.fit(np.array([fit.modes[0].pole]))
         (mode,) = window_fit.modes
+        # the complex amplitude at the middle of the window in place of that at its start
         to_middle = cmath.exp(mode.pole * 0.5 * WINDOW)
         mode = mode._replace(wave=mode.wave * to_middle)
         if mode.amplitude > _VISIBLE_AMPLITUDE * float(window_fit.deviation[0]):

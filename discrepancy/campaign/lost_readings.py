@@ -98,11 +98,13 @@ def leave_out_lost_readings(
         lost_rows = [row for row in text_rows if _is_not_a_number(cells[row])]
         overload_rows = [row for row in text_rows if _is_overload(cells[row])]
         cleaned_cells = list(cells)
+        # "NaN" and the like, anywhere in the column
         if lost_rows:
             for row in lost_rows:
                 cleaned_cells[row] = ""
             places = places_text(unit_of_place, [lines[row] for row in lost_rows])
             remark += f"; {title!r} has {cells[lost_rows[0]]} in {places}"
+        # overloads below the first number: from there on the column has no readings
         if number_rows and overload_rows and overload_rows[0] > number_rows[0]:
             first_row = overload_rows[0]
             cell, line = cells[first_row], lines[first_row]

@@ -84,6 +84,7 @@ def history_figure(before: ResidualSet, after: ResidualSet | None, worst: Worst)
     figure, ((axes,), *rows_below) = new_panels(
         panel_count, 1, 1.45 * panel_count + 0.35, height_ratios=height_ratios, sharex=True
     )
+    # upper panel: readings, and the predictions of the models
     axes.margins(x=0.01)
     readings = factor * fitted.trial.values[is_used, column]
     axes.plot(time[is_used], readings, ".", ms=1.8, color=style.OBSERVED, label="measured")
@@ -92,6 +93,7 @@ def history_figure(before: ResidualSet, after: ResidualSet | None, worst: Worst)
         axes.plot(time, prediction, drawn.dashes, lw=0.9, color=drawn.colour, label=drawn.label)
     axes.set(ylabel=f"{worst.channel}, {unit}", title=f"a  {worst.channel} in {fitted.trial.name}")
     axes.legend(**ABOVE, ncol=3)
+    # below: the residuals of each model, with the noise as a band
     panels_below = [panel for (panel,) in rows_below]
     for letter, panel, drawn in zip("bc", panels_below, drawn_models, strict=False):
         fitted_by_model = drawn.residuals.trials[worst.trial]

@@ -108,9 +108,11 @@ def ports_of_blocks(trial: Trial, blocks: Iterable[LoadedSystem]) -> PortsAtRest
     for block in blocks:
         system = block.system
         ports = tuple(system.ports)
+        # rows of the ports on the unknowns (P, N), without states
         port_rows = np.array([system.ports[name] for name in ports])
         port_rows[:, system.displacement_count :] = 0.0
         with errors_at_rest(trial):
+            # the displacements under unit loads, and under unit forces at the ports
             displacements = system.equilibrium_under(block.directions)
             flexibility = system.equilibrium_under(port_rows)
         positions.append(block.levels[block.rows] @ displacements @ port_rows.T)

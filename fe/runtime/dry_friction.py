@@ -39,6 +39,7 @@ def hold_stuck_ports(
         inverse_mass = ports.inverse_mass[j]
         strength = speed.strength(law, position, inverse_mass)
         limit = speed.holding_limit(law, strength, 0.5 * h)
+        # the impulse after which the port is at the position of sticking at the end of the step
         displacement = position - port_value(ports.motion_rows, j, state.q)
         impulse = displacement / port_value(ports.motion_rows, j, response[:mode_count])
         if abs(impulse) * inverse_mass > limit:

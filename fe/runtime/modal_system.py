@@ -80,6 +80,7 @@ def rayleigh_coefficients(
             "Two different positive frequencies are needed for two Rayleigh coefficients, but "
             f"{frequency} Hz were given."
         )
+    # the solution of zeta_i = (alpha / omega_i + beta omega_i) / 2 for i = 1, 2
     difference = omega_2**2 - omega_1**2
     beta = 2.0 * (damping_ratio[1] * omega_2 - damping_ratio[0] * omega_1) / difference
     alpha = (

@@ -298,6 +298,7 @@ class SensorLag(Sensor):
         delayed_values, delayed_rates = interpolated_by_cubics(
             record.time, values, rates, delayed_time
         )
+        # linear extrapolation before the first and after the last sample
         first_rate = np.zeros_like(rates[0]) if record.settled else rates[0]
         is_before_record = delayed_time < record.time[0]
         delayed_values[is_before_record] = values[0] + np.outer(

@@ -135,6 +135,7 @@ def _mean_rotation(
     and (K_ei - K_ee c_i / c_e) / c_e elsewhere, where K is the stiffness without the moment. These
     are solved for the weights c. The result is None if the moment makes no new unknown.
     """
+    # the matrices with a moment at the node, and the unknowns that it adds and removes
     node, direction = dof
     loaded = jobs.matrices("moment", blocks, step_lines=("*CLOAD", f"{node},{direction},1."))
     new_dofs = Counter(loaded.dofs) - Counter(matrices.dofs)
@@ -145,10 +146,12 @@ def _mean_rotation(
     eliminated = _eliminated_row(matrices, loaded, rotation, next(iter(lost_dofs)))
     if eliminated is None:
         return None
+    # rows K_e of the eliminated unknown, and of the rotation in the new stiffness
     other_rows = np.delete(np.arange(len(matrices.dofs)), eliminated)
     other_rows_loaded = np.delete(np.arange(len(loaded.dofs)), rotation)
     old_row = matrices.stiffness[[eliminated]].toarray().ravel()
     new_row = loaded.stiffness[[rotation]].toarray().ravel()
+    # c_e from the diagonals, then the other c_i
     weights = np.empty(len(matrices.dofs))
     weights[eliminated] = np.sqrt(old_row[eliminated] / new_row[rotation])
     difference = old_row[other_rows] - weights[eliminated] * new_row[other_rows_loaded]

@@ -303,6 +303,7 @@ def patches_of_mesh(
     region_of : (nc,) array of int
         Index of the damage region of each cell, -1 for none.
     """
+    # named sets of the mesh that are small enough, and do not overlap others
     is_free_cell = region_of < 0
     patches: dict[str, IntArray] = {}
     for name, cells in mesh.cell_sets.items():
@@ -312,6 +313,7 @@ def patches_of_mesh(
         if is_small and is_free_cell[cells].all() and not name.startswith(SETS_OF_THE_MESHER):
             patches[name] = cells
             is_free_cell[cells] = False
+    # the remaining cells, in patches around points that are spread evenly
     unnamed_cells = np.flatnonzero(is_free_cell)
     if len(unnamed_cells):
         centres = mesh.centres[unnamed_cells]
@@ -474,6 +476,7 @@ def gauge_shifts(structure: AffineStructure) -> list[GaugeShift]:
                     difference_quotients.append((rows - rows_at_gauge) / distance)
             if not difference_quotients:
                 continue
+            # the central difference and the second difference; one quotient alone is a line
             slope = (difference_quotients[0] + difference_quotients[-1]) / 2.0
             curvature = (difference_quotients[0] - difference_quotients[-1]) / step
             derivatives = factor * sparse.vstack((slope, curvature)) @ structure.expansion

@@ -120,6 +120,7 @@ def _soften_support(tables: Tables, mesh: StructureMesh, primitive: SupportCompl
         centre = set_weights(mesh, primitive.support, "the support") @ mesh.points
         row["rigid_about"] = (centre / mesh.unit).tolist()
         row["hold"] = list(MOTIONS)
+    # one spring for each motion; zero stands for none
     springs = [*row.get("springs", ()), *[0.0] * len(MOTIONS)][: len(MOTIONS)]
     number = MOTIONS.index(primitive.motion)
     compliance = primitive.compliance

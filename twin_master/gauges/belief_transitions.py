@@ -122,6 +122,9 @@ def advance_rows(
     levels, first_row, start, predecessor, probability, _ = lists
     pairs, faults = rows.shape
     is_touched = is_nonzero.copy()
+    # A transition is the product of blocks, each of one or more factors of the state. Pair number
+    # (o * levels + level) * inner + i has this level of the block; the blocks are applied in turn,
+    # from `rows` to `work` and back.
     outer = 1
     inner = pairs
     source = rows
@@ -136,6 +139,7 @@ def advance_rows(
             list_row = first_row[block] + control * level_count + level
             for i in range(inner):
                 to = outer_level * inner + i
+                # the sum over the levels before, without rows that are zero
                 has_sum = False
                 for k in range(start[list_row], start[list_row + 1]):
                     before = (o * level_count + np.int64(predecessor[k])) * inner + i
@@ -154,6 +158,7 @@ def advance_rows(
         outer *= level_count
         source, target = target, source
         source_is_nonzero, target_is_nonzero = target_is_nonzero, source_is_nonzero
+    # After an odd number of blocks the result is in `work`. Rows that became zero are cleared.
     is_in_work = len(levels) % 2 == 1
     for i in range(pairs):
         if is_in_work:
@@ -266,6 +271,7 @@ def advance_beliefs(
         advance_belief(lists, now, draws, free_gains, single_work)
         advance_rows(lists, now, is_nonzero, gauge, row_is_nonzero, row_work)
 
+        # faults begin: their beliefs are mixed with that of the model
         begin_gauge_faults(
             model,
             onsets.gauge[twin],
@@ -281,6 +287,7 @@ def advance_beliefs(
             free_gains[i] = earlier * free_gains[i] + new * np.float32(model[i])
             recovering[i] += recoveries.free_gains_weight[twin] * free_gains[i]
             total += recovering[i]
+        # faults end: "recovered" is mixed with the average belief under the faults that have ended
         if total > 0.0:
             fraction = recoveries.new_fraction[twin]
             for i in range(pairs):

@@ -78,6 +78,7 @@ def free_gain_densities(
         np.empty(2 * gauges),
     )
     for g in range(gauges):
+        # the fitted gain with its variance, from the regression so far; without a gain both are 0
         variance = 1.0 / (1.0 + statistics.sum_cc[twin, g])
         fixed = gauges + g
         densities.gauge[g] = g
@@ -117,6 +118,7 @@ def weigh_free_gains(
     gauges = len(free_probability)
     count = len(positions)
     factors = exchange_factors(observation, model, densities)
+    # factors of both densities of each gauge: its probability, and what the ratios leave out
     factor = np.empty(2 * gauges)
     for g in range(gauges):
         fixed = gauges + g
@@ -147,6 +149,7 @@ def weigh_free_gains(
             residual[gauges + g] = residual[g]
             prediction[gauges + g] = prediction[g]
         exchange_densities(factors, residual, prediction, square, ratio, work)
+        # belief times the density of all gauges: that of the model times the mixture of each gauge
         product = belief[i] * model.density[positions[m]]
         for g in range(gauges):
             free_density = factor[g] * ratio[g]
@@ -199,6 +202,7 @@ def weigh_free_gains_in_logs(
             weights.free_probability[m, g] = np.exp(log_free - log_mixture)
             weights.free_square[m, g] = innovation * innovation / variance
         largest = max(largest, log_density[m])
+    # the weights relative to the largest density
     for m in range(count):
         belief_in_pair = belief[model.pair[positions[m]]]
         weights.weight[m] = belief_in_pair * np.exp(log_density[m] - largest)
@@ -284,6 +288,8 @@ def _update_statistics(
     free_squares = np.zeros(gauges)
     sum_cc = np.zeros(gauges)
     sum_cx = np.zeros(gauges)
+    # expected values: x is the residual, and c the change of the reading by one prior standard
+    # deviation of the gain
     for m in range(len(positions)):
         i = model.pair[positions[m]]
         weight = weights.weight[m]
@@ -295,6 +301,7 @@ def _update_statistics(
             fixed_squares[g] += weight * x * x
             sum_cc[g] += weighted_c * deviation * observation.prediction[i, g]
             sum_cx[g] += weighted_c * x
+    # a gauge without a reading keeps its statistics
     for g in range(gauges):
         if observation.present[g]:
             statistics.free_probability[twin, g] = free_probability[g]

@@ -94,6 +94,7 @@ def weigh_gauge_faults(
     sum_products = np.zeros(count, np.float32)
     for j in range(len(model.pair)):
         i = model.pair[j]
+        # density under each fault: that of the model, with the density of the gauge exchanged
         density = np.float32(model.density[j])
         for r in range(count):
             residual[r] = observation.residual[i, r // GAINS_PER_SENSOR]
@@ -133,12 +134,14 @@ def weigh_gauge_fault_in_logs(
     count = len(model.pair)
     log_density = np.empty(count)
     log_density_of_sound_gauges(observation, model.pair, model.scale_squares, log_density)
+    # the log density under the fault at each pair, and the largest one at pairs that count
     largest = -np.inf
     for j in range(count):
         i = model.pair[j]
         log_density[j] += log_exchanged_density(observation, model, faults, r, i)
         if belief[i, r] >= NEGLIGIBLE_UNDER_FAULT:
             largest = max(largest, log_density[j])
+    # the weights relative to the largest density, and their sums
     total = 0.0
     sum_squares = 0.0
     sum_predictions = 0.0
@@ -216,10 +219,12 @@ def update_gauge_faults(
     weight, sums = weigh_gauge_faults(observation, model, faults, belief)
     inverse = np.empty(count, np.float32)
     zero = np.float32(0.0)
+    # the evidence of each fault, and its regression by expected products over the pairs
     for r in range(count):
         log_scale = model.log_density + log_reference_density(observation, model, faults, r)
         largest = sums.weight[r] + sums.squares[r] + sums.predictions[r] + abs(sums.products[r])
         if not (sums.weight[r] > _LEAST_TOTAL and largest < np.inf):
+            # single precision overflowed or underflowed
             log_scale = weigh_gauge_fault_in_logs(
                 observation, model, faults, belief, r, weight, sums
             )
@@ -235,6 +240,7 @@ def update_gauge_faults(
         beliefs.gauge_squares[twin, r] += sums.squares[r] * inverse[r]
         beliefs.gauge_sum_cc[twin, r] += sum_of_c_squared * inverse[r]
         beliefs.gauge_sum_cx[twin, r] += sum_of_c_x * inverse[r]
+    # the belief in each pair under each fault, with the sum 1
     for j in range(len(model.pair)):
         i = model.pair[j]
         believing = np.int64(0)

@@ -223,6 +223,7 @@ class InspectedSensorModel(GaussianSensorModel):
                 f"expected {sensor_count} finite values, or {sensor_count + inspection_count} with "
                 f"the readings of inspections, got {rows.shape[-1]}"
             )
+        # Gaussian log densities (..., S, I) of each reading in each state
         residual = (readings[..., None, :] - self.expected_reading) / self.reading_deviation
         log_density = -0.5 * residual**2 - np.log(self.reading_deviation) - LOG_ROOT_TWO_PI
         was_inspected = ~np.isnan(readings)[..., None, :]

@@ -161,12 +161,15 @@ def _cheapest_meeting(grids: SubGrids, control: Index, backward_lanes: Index) ->
     has one axis, whereas a forward pass alone would have two axes after the change.
     `backward_lanes` (T,) is work space.
     """
+    # `axes` has a bit for each axis of the grid; `grids.first` counts the lanes of each set of
+    # axes. First the work of a backward pass from the end to each step:
     steps = len(control)
     axes = 0
     backward_lanes[steps - 1] = 0
     for t in range(steps - 1, 0, -1):
         axes |= grids.axes_of_control[control[t - 1]]
         backward_lanes[t - 1] = backward_lanes[t] + grids.first[axes + 1] - grids.first[axes]
+    # then that of a forward pass up to each step, and the step with the least sum of both
     axes = 0
     forward_lanes = 0
     meeting = 0
@@ -234,6 +237,7 @@ def _forward_to(
 ) -> tuple[int, Float, Float]:
     """Compute the forward sums of a twin up to the step `meeting`; see `_backward_to`."""
     state_count = likelihood.shape[1]
+    # before the first transition the sums depend on no axis
     axes = 0
     lanes = grids.first[1]
     for state in range(state_count):
