@@ -257,6 +257,7 @@ def measure_ring_down(
     generator = np.random.default_rng(child_seed(seed, _RING_DOWN))
     records = []
     for trial in range(1, trials + 1):
+        # release by hand, noise of the recorder, and its resolution
         relative_error = _RELEASE_DEVIATION * float(generator.standard_normal())
         tip_displacement = initial_tip_displacement * (1.0 + relative_error)
         time, signal = bench.ring_down(tip_displacement, duration, sampling_rate)

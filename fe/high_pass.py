@@ -125,10 +125,12 @@ def high_pass(
     count = len(signal)
     if count == 0:
         return np.array(signal, dtype=np.float64)
+    # convolution of the increments with the response to one of them
     responses = _filter_responses(count, interval / time_constant, float(order))
     rows = np.asarray(signal, dtype=np.float64).reshape(count, -1)
     increments = np.diff(rows, axis=0, prepend=rows[:1])
     output = fftconvolve(increments, responses.increment[:, None], axes=0)[:count]
+    # the jump from the level before the record to the first sample
     if levels_before is not None:
         level_row = np.broadcast_to(levels_before, np.shape(signal)[1:]).reshape(-1)
         jump = rows[0] - level_row

@@ -85,6 +85,7 @@ def fit_masses(
     for modulus_factor in young_modulus_factor.tolist():
         servo_mass = _nearest_servo_mass(frequencies, modulus_factor, total_mass, target, limits)
         pitot_mass = total_mass - 2.0 * servo_mass
+        # the model's frequencies with these masses give alpha and beta
         fitted_pair = frequencies(np.array([[modulus_factor, servo_mass, pitot_mass]]))[0]
         frequency_1, frequency_2 = fitted_pair.tolist()
         alpha, beta = damping_coefficients((frequency_1, frequency_2), ratios)

@@ -70,6 +70,7 @@ def corner_figure(titles: Sequence[str], sets: Sequence[tuple[str, Float]]) -> F
     limits = [
         _limits([values[:, column] for values in samples]) for column in range(parameter_count)
     ]
+    # correlations above the diagonal, histograms on it, scatter plots below
     for (row, column), axes in np.ndenumerate(np.array(grid)):
         if column > row:
             _write_correlation(axes, float(correlation[row, column]))
@@ -225,6 +226,7 @@ def _draw_reading(axes: Axes, result: Calibration, reading: QuantityReading) -> 
     half_width = HALF_WIDTH_95 * reading.deviation
     mean = float(posterior.mean())
     deviation = max(float(posterior.std()), 1e-6 * abs(mean))
+    # the range shows the posterior and the reading; a positive quantity begins at zero
     low = min(mean - 4.5 * deviation, value - 1.6 * half_width)
     high = max(mean + 4.5 * deviation, value + 1.6 * half_width)
     if mean > 0.0:
@@ -239,6 +241,7 @@ def _draw_reading(axes: Axes, result: Calibration, reading: QuantityReading) -> 
         label="measured, 95 %",
     )
     axes.axvline(value, color=style.OBSERVED, lw=0.9)
+    # densities by Gaussian kernels; a posterior of one value only has none, and is a line
     prior_density = gaussian_kde(prior)(grid)
     highest_density = float(prior_density.max())
     if posterior.std() > 1e-9 * abs(mean):

@@ -366,6 +366,7 @@ def _samples_at_rest(
         time = check_sampling(table.numbers("time", user), cells, user, table.name)
         if is_nearly_even(time):
             interval = float(time[-1] - time[0]) / (len(time) - 1)
+    # the samples of each channel, without the empty cells at the end of its column
     records = {}
     for channel in section.channel:
         if channel.table_column not in table.columns:

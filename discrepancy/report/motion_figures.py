@@ -183,6 +183,7 @@ def _mean_spectrum(residuals: ResidualSet, channel: str) -> _Spectrum | None:
     for fitted, column, _ in channel_fits(residuals.trials, channel):
         if not fitted.trial.is_dynamic or len(fitted.trial.time) < 32:
             continue
+        # Welch's estimate of the power; white noise of variance 1 has the power 1 at each frequency
         interval = fitted.trial.interval
         series = np.nan_to_num(fitted.standardised[:, column])
         segment_length = min(len(series), 512)

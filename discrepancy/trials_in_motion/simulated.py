@@ -210,11 +210,13 @@ def solve_forces(
         The forces, which contain first guesses where there are several ports, and their tangents.
     """
     ports = len(forces)
+    # motion of each port by a unit force at each port, and without the forces
     position_by_force, speed_by_force = np.zeros((2, ports, ports))
     multiply(system.position_rows, by_force, position_by_force)
     multiply(system.speed_rows, by_force, speed_by_force)
     free_positions, free_speeds = positions.copy(), speeds.copy()
     add_motion(system, state, free_positions, free_speeds)
+    # Gauss-Seidel: each force is solved with the latest forces at the other ports
     for _ in range(1 if ports == 1 else SWEEPS):
         for p in range(ports):
             position, speed = free_positions[p], free_speeds[p]

@@ -189,6 +189,8 @@ class TrialAtRest:
         law_ports = [self.ports.index(port) for port in active_laws.ports]
         free_positions = self.positions_without_forces(unknowns)
         forces: dict[int, FloatArray] = {port: np.zeros(len(self.time)) for port in law_ports}
+        # Within a block of successive rows the compliance is constant. The laws keep their memory
+        # from one block to the next.
         memory = None
         previous_positions = None
         for steps in self._blocks:

@@ -323,7 +323,8 @@ class ChangeableModel(ReducedModel):
     ) -> FloatArray:
         """Return the load (n,) of a control after a patch has moved or turned its force.
 
-        An offset is a Taylor series of second order in the distance; a tilt is a rotation.
+        By an offset, the load changes as a Taylor series of second order in the distance. By a
+        tilt, it is turned towards the load of a force perpendicular to it.
 
         Parameters
         ----------

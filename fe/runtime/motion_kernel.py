@@ -119,6 +119,7 @@ def start_laws(ports: PortArrays, state: ModalState, memory_is_known: bool) -> N
         law = ports.parameters[j]
         memory = state.memory[j]
         if ports.leader[j] == SPEED_LAW:
+            # it acts by impulses, and has no force; friction at a port at rest sticks
             memory[FORCE] = 0.0
             holds = speed.can_hold(law) and speed.strength(law, x, ports.inverse_mass[j]) > 0.0
             if holds and v == 0.0:

@@ -202,6 +202,7 @@ class ModalIntegrator:
             If laws have no equilibrium on the way.
         """
         rest_state = self.equilibrium(load)
+        # the force that causes the offset, and the static state under it
         response = self.structure.unit_responses[:, holding_load]
         force = offset / float(self.structure.output_rows[-1] @ response) if offset else 0.0
         if force and self._law_count:
@@ -212,6 +213,7 @@ class ModalIntegrator:
         if self.structure.holding_load is not None and self._responses.beta > 0.0:
             removed_load = force * np.eye(self._responses.load_count)[self.structure.holding_load]
             state = replace(state, load=state.load + removed_load)
+        # the forces of the laws just after the release
         if self._law_count:
             memory = rest_state.memory.copy()
             motion = self._motion_with_laws(state, rest_state.load, INSTANT, 0.0)
@@ -363,6 +365,7 @@ class ModalIntegrator:
         rows = self.structure.acceleration_rows
         if not len(rows):
             return np.asarray(outputs)
+        # equation of motion of the kept modes: q'' = f - 2 zeta omega q' - omega^2 q
         omega = self._responses.omega
         acceleration = (
             self._responses.participation @ static_loads

@@ -196,6 +196,7 @@ def _nodal_forces(
             f"pressure is left out: an element {element.type_name} has {expected_count} nodes, but "
             f"one here has {len(element.nodes)}"
         )
+    # the positions of the face's nodes: of a shell, those on its expanded top or bottom
     positions = np.zeros((kind.node_count, 3))
     if loaded.side is None:
         numbers = [element.nodes[node] for node in face_nodes]
@@ -203,6 +204,7 @@ def _nodal_forces(
     else:
         numbers = list(element.nodes)
         positions[list(face_nodes)] = shells.side_positions(number, loaded.side)
+    # the face as the surface of a mesh of one cell: pressure times its nodal area vectors
     cell = np.arange(kind.node_count)[None]
     solid = CellMesh(points=positions, cells=cell, kind=kind)
     surface = Surface(np.array([0]), np.array([face]))

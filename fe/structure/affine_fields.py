@@ -64,9 +64,9 @@ def affine_fields(
     outputs: OutputRows,
     support_motions: tuple[SupportMotion, ...] = (),
 ) -> AffineFields:
-    """Project mass, loads and outputs on the free unknowns.
+    """Return the fields of `AffineStructure` but the design, its hash and the stiffness terms.
 
-    The result has all fields of `AffineStructure` but the design, its hash and the stiffness terms.
+    Mass, loads and outputs are projected on the free unknowns.
 
     Parameters
     ----------
@@ -85,6 +85,7 @@ def affine_fields(
     InvalidDesignError
         If a port lies where nothing can move.
     """
+    # an acceleration loads each mass by itself, so that its load has one term for each of them
     restriction = expansion.T.tocsr()
     masses = _masses_by_name(design, mass, point_masses)
     load_terms = []
@@ -94,6 +95,7 @@ def affine_fields(
             continue
         for mass_name, matrix in masses.items():
             load_terms.append(LoadTerm(load.name, restriction @ (matrix @ vector), mass_name))
+    # the unknowns of released support motions come last; they do not count for the ports' motion
     port_output = (outputs.port @ expansion).tocsr()
     released = [motion for motion in support_motions if motion.spring == 0.0]
     held_count = port_output.shape[1] - len(released)

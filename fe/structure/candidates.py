@@ -178,7 +178,12 @@ class MassPlace(NamedTuple):
 
 
 def places_of_mesh(mesh: StructureMesh) -> Iterator[MassPlace]:
-    """Yield the named sets of nodes, then the points of a coarse grid of nodes."""
+    """Yield the places of a mesh at which a point mass may be added.
+
+    These are first the named sets of nodes, then nodes that are spread evenly over the mesh. A mass
+    at one of the latter may also lie beside the node, up to the `reach` of the place: there its
+    weights follow from their slopes.
+    """
     for name, nodes in mesh.node_sets.items():
         is_place = np.all(nodes >= 0) and len(nodes) < LARGEST_NODE_SHARE * len(mesh.points)
         if is_place and not name.startswith(SETS_OF_THE_MESHER):
@@ -188,6 +193,7 @@ def places_of_mesh(mesh: StructureMesh) -> Iterator[MassPlace]:
     grid_numbers = _spread_points(
         mesh.points[corner_nodes], GRID_POINTS, LEAST_DISTANCE_OF_POINTS * mesh.size
     )
+    # reach: the largest distance of any node from the nearest of these points
     grid = mesh.points[corner_nodes[grid_numbers]]
     distance_from_grid, _ = KDTree(grid).query(mesh.points)
     reach = float(distance_from_grid.max())
@@ -372,6 +378,7 @@ def load_changes(structure: AffineStructure) -> list[LoadChange]:
         force = np.asarray(load.force)
         weights = force_weights(mesh, load, label)
         for axis, direction in zip(AXES, np.eye(3), strict=True):
+            # tilt: a force of the same size, perpendicular to the force and towards the axis
             perpendicular = direction - force * (force @ direction) / (force @ force)
             length = float(np.linalg.norm(perpendicular))
             if length > LEAST_SINE:
@@ -379,6 +386,7 @@ def load_changes(structure: AffineStructure) -> list[LoadChange]:
                 vector = structure.expansion.T @ np.outer(weights, tilted_force).ravel()
                 no_curvature = np.zeros_like(vector)
                 changes.append(LoadChange(load.control, "tilt", axis, vector, no_curvature))
+            # offset: first and second derivative of the load by the distance along the axis
             derivatives = _derivatives_of_weights(mesh, load, direction, label)
             if derivatives is not None:
                 vector, curvature = [

@@ -153,7 +153,7 @@ class _NodeSupports:
 def supports_of_design(
     design: MeshDesign, mesh: StructureMesh, *, yielding: bool = False
 ) -> Supports:
-    """Check the supports of a design and return the free unknowns.
+    """Return the supports of a design: held displacements, springs, rigid sets and free unknowns.
 
     Parameters
     ----------
@@ -175,6 +175,7 @@ def supports_of_design(
         springs=np.zeros(shape),
         scaled_springs={},
     )
+    # supports that hold or spring single nodes, and rigid sets
     for label, support in design.numbered("support"):
         nodes = mesh.nodes_of(support.set, label)
         if support.rigid_about is not None:
@@ -194,6 +195,7 @@ def supports_of_design(
     rigid_sets = tuple(bodies.values())
     _check_rigid_motions(mesh, nodal, rigid_sets)
     held_supports = supports(mesh.points, nodal.held, nodal.springs, rigid_sets)
+    # the motions of rigid sets against springs are free unknowns, after the displacements of nodes
     sets_of_bodies = [
         support.set for _, support in design.numbered("support") if support.rigid_about is not None
     ]
@@ -204,6 +206,7 @@ def supports_of_design(
     )
     if not yielding:
         return held_supports
+    # the motions that are held, as further unknowns
     held = dict(_held_motions(design, mesh))
     for set_name, body in zip(sets_of_bodies, rigid_sets, strict=True):
         for number in np.flatnonzero(body.held).tolist():

@@ -195,14 +195,16 @@ def compare_fleets(folders: Sequence[Path]) -> Statistics:
         statistics[named.name] = {"policy": named.policy} | group_statistics(named.group)
         if RETURN not in statistics[named.name]:
             continue
+        # the return that the twin's model expects of the policy
         if len(named.record["scenarios"]) == 1:
-            promised = promised_return(knowledge_of_scenario(named.folder, named.record, 0))
+            expected_return = promised_return(knowledge_of_scenario(named.folder, named.record, 0))
             statistics[named.name] = _with_statistic_after(
                 statistics[named.name],
                 RETURN,
                 RETURN_PROMISED,
-                Estimated(promised.mean, promised.half_width / NORMAL_95),
+                Estimated(expected_return.mean, expected_return.half_width / NORMAL_95),
             )
+        # the difference from the first group, seed by seed
         if named is not first and RETURN in statistics[first.name]:
             difference = _difference_of_returns(named.group, first.group)
             statistics[named.name] = _with_statistic_after(

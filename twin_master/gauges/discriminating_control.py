@@ -96,7 +96,9 @@ def _probability_to_discriminate(
 ) -> float:
     """Return the probability that steps under a control make the true hypothesis almost certain.
 
-    The state stays the same in these steps.
+    Readings are simulated under each of the two hypotheses; the state stays the same in these
+    steps. The true hypothesis is almost certain if the log odds in its favour, after the readings,
+    are at least `_LOG_ODDS_OF_ALMOST_CERTAIN`.
     """
     log_odds = np.log(first.probability / second.probability)
     generator = np.random.default_rng(0)
@@ -109,7 +111,7 @@ def _probability_to_discriminate(
         log_density_of_second = np.zeros_like(log_density_of_first)
         for _ in range(steps):
             rows = sensor_model.draw_observations(states, control, generator)
-            rows[:, : sensor_model.sensor_count] += error
+            rows[:, : sensor_model.sensor_count] += error  # the wrong gain of the gauge
             log_density_of_first += _log_density(first, sensor_model, control, rows)
             log_density_of_second += _log_density(second, sensor_model, control, rows)
         log_ratio = _log_mean(log_density_of_first, first) - _log_mean(

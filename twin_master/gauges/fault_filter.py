@@ -263,6 +263,8 @@ class FaultFilter:
         state.log_free_gains_evidence = log_total
         new_weight = 1.0 - earlier_weight
         state.free_gains_onset += new_weight[:, 0] * (state.step_count - state.free_gains_onset)
+        # The regression of each gauge is an average over the two cases. In the new one it begins
+        # anew: prior probability, the squares of the model, and no sums.
         statistics = state.free_gain_statistics
         statistics.free_probability[:] += new_weight * (
             FREE_GAIN_PROBABILITY - statistics.free_probability
@@ -371,8 +373,10 @@ class FaultFilter:
         model_squares = beliefs.model_squares
         gain_count = len(_GAINS)
         difference = beliefs.gauge_squares - np.repeat(model_squares, gain_count, axis=1)
+        # average over the faults of gauges: only the faulty gauge differs from the model
         by_gauge = (recoveries.gauge_weight * difference).reshape(len(difference), -1, gain_count)
         new_squares = model_squares + by_gauge.sum(axis=2)
+        # the fault of free gains: each gauge is a mixture of one with and one without a gain
         statistics = state.free_gain_statistics
         free_probability = statistics.free_probability
         free_gains_squares = (

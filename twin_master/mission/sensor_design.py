@@ -169,6 +169,7 @@ def _draw_under_control(
         drawn_states = random_numbers.permutation(states)[:SAMPLES]
     state = np.tile(drawn_states, round(SAMPLES / len(drawn_states)))
     values = sensors.draw_observations(state, control, random_numbers)[:, : sensors.sensor_count]
+    # common errors of the sensors: within the interval of a state, and by the parameter
     deviation = sensors.independent_standard_deviation[:, control]
     loadings = np.concatenate(
         (sensors.interval[:, control], _loading_of_parameter(sensors, control)), axis=-1
@@ -322,8 +323,9 @@ def level_separations(
     state_indices = np.arange(states.size).reshape(states.shape)
     separations = {}
     for axis, factor in enumerate(states.factors):
-        by_level = np.moveaxis(state_indices, axis, 0).reshape(len(factor.levels), -1)
-        others_at_lowest = by_level[:, 0]
+        # (levels, states of the other factors): the first column has those at their lowest levels
+        states_by_level = np.moveaxis(state_indices, axis, 0).reshape(len(factor.levels), -1)
+        others_at_lowest = states_by_level[:, 0]
         for level, (low, high) in enumerate(itertools.pairwise(others_at_lowest)):
             squared_distances = []
             for control, readings_of_control in enumerate(readings):

@@ -190,6 +190,8 @@ def plan_on_belief(
         The largest number of visits to beliefs. If left out, it is 180, or 1000 if the upper bound
         cannot settle.
     """
+    # Descend from the prior to beliefs at which the bounds differ most; then improve both bounds at
+    # these beliefs, the last one first, because earlier bounds follow from later ones.
     bounds = _Bounds(problem)
     visited: list[Float] = []
     next_settling = _FIRST_SETTLING
@@ -203,6 +205,7 @@ def plan_on_belief(
         visited += path
         if not most_beliefs:
             most_visits = MOST_BELIEFS if bounds.upper.can_settle() else MOST_UNSETTLED
+        # now and then, improve the bounds at all visited beliefs
         if len(visited) >= min(next_settling, most_visits):
             next_settling = int(_SETTLING_GROWTH * len(visited))
             bounds.upper.settle()

@@ -340,6 +340,7 @@ class GraphicalModel:
         for control, table in tables.items():
             _check_factor_names(control, table, levels)
 
+        # the joint prior is the product over the factors, the last factor varies fastest
         joint_prior: Float = np.ones(1)
         for factor in states.factors:
             size = len(factor.levels)

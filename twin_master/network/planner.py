@@ -284,10 +284,12 @@ def ration_controls(
         transition.forward(int(control_in_force[twin]), filtered_belief[twin])
         for twin in requesting_twins
     ]
+    # gain of the best scarce control over the best other one, for each requesting twin
     action_value = policy.action_value(np.array(predicted_beliefs), transition.shape[0])
     other_action_value = action_value.copy()
     other_action_value[:, scarce] = -np.inf
     gain = action_value[:, scarce].max(axis=1) - other_action_value.max(axis=1)
+    # all but the `budget` twins with the largest gains take their best other control
     refused_positions = np.argsort(-gain, kind="stable")[budget:]
     rationed = chosen_controls.copy()
     rationed[requesting_twins[refused_positions]] = np.argmax(

@@ -209,6 +209,7 @@ def _backward_to(
         control_in_force = control[t - 1]
         axes_before = axes
         axes |= grids.axes_of_control[control_in_force]
+        # a control with axes of its own: from here on the sums depend on these, too
         if axes != axes_before:
             _spread_lanes(grids, axes_before, axes, current, other)
             current, other = other, current
@@ -306,6 +307,7 @@ def evidence_on_grid(
         forward_axes, forward, other = _forward_to(
             meeting, prior, lists, grids, control[twin], likelihood[twin], forward, other
         )
+        # at each point of the grid, its lane among those of the axes of either sum
         for point in range(result.shape[1]):
             lane = grids.first[all_axes] + point
             forward_lane = _lane_in(grids, forward_axes, lane)
