@@ -19,7 +19,6 @@ from discrepancy.judgement.separability import Detectability, Separability, comp
 from discrepancy.system.structures import StructureModel
 from discrepancy.system.system_state import SystemState
 from fe.runtime.patch import ModelPatch
-from fe.structure.tables import StructureDesign
 
 SUSPECTS = (
     "support_compliance",
@@ -86,18 +85,6 @@ class Plan(NamedTuple):
         return row.effect.patch(self.setting, values, row.place)
 
 
-def check_forces(structure: StructureDesign) -> None:
-    """Raise `ModelError` if a structure has no force, without which no load line can be planned.
-
-    The structure file says so before the structure is reduced, which takes seconds to minutes.
-    """
-    if all(control.unit != "N" for control in structure.control):
-        raise ModelError(
-            f"The structure {structure.name} has no control in N: a planned load line needs one; "
-            'give a [[control]] with unit = "N" and a [[load]] tied to it.'
-        )
-
-
 def plans_of(
     model: StructureModel, precision: Precision, catalogue: Sequence[Effect]
 ) -> tuple[Plan, Plan]:
@@ -106,7 +93,7 @@ def plans_of(
     Parameters
     ----------
     model : StructureModel
-        The structure with the changes that it may have; it has a force, see `check_forces`.
+        The structure with the changes that it may have.
     precision : Precision
         How precise the channels are.
     catalogue : sequence of Effect
@@ -115,8 +102,13 @@ def plans_of(
     Raises
     ------
     ModelError
-        If the structure has nothing that is read at rest.
+        If the structure has no force, or nothing that is read at rest.
     """
+    if not model.forces:
+        raise ModelError(
+            f"The structure {model.name} has no control in N: a planned load line needs one; give "
+            'a [[control]] with unit = "N" and a [[load]] tied to it.'
+        )
     if set(model.quantities.values()) <= {Quantity.ACCELERATION}:
         raise ModelError(
             f"The structure {model.name} has neither a gauge nor a displacement, which a planned "

@@ -42,19 +42,16 @@ def suspects(
     """
     from discrepancy.campaign.records import Quantity
     from discrepancy.catalogue.library import library
-    from discrepancy.planned_measurement import Precision, check_forces, plans_of
+    from discrepancy.planned_measurement import Precision, plans_of
     from discrepancy.system.structures import StructureModel
     from fe.reduction.model_cache import changeable_model
-    from fe.structure.design import load_structure
 
     noise = {
         Quantity.STRAIN: 1e-6 * strain_noise,
         Quantity.DISPLACEMENT: 1e-3 * displacement_noise,
         Quantity.ACCELERATION: acceleration_noise,
     }
-    path = find_structure(file)
-    check_forces(load_structure(path))
-    model = StructureModel(changeable_model(path))
+    model = StructureModel(changeable_model(find_structure(file)))
     with stage("What the planned measurement can decide"):
         static, with_releases = plans_of(model, Precision(noise, 0.01 * gain), library())
     rows = _rows(static, with_releases)

@@ -253,6 +253,11 @@ class FilteredTrial:
             covariances,
         )
 
+    def forces_of_residual(self, residual: FloatArray) -> dict[int, FloatArray]:
+        """Return the missing force (F,) by port that is estimated from a residual (N, C)."""
+        states, _ = self.smooth_residual(residual)
+        return self.missing_forces(states)
+
     def missing_forces(self, states: FloatArray) -> dict[int, FloatArray]:
         """Return the missing force (F,) at each port, given scaled states (F, n).
 

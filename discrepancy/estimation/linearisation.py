@@ -23,6 +23,9 @@ from .linearised_rest import LinearisedRest, RestUnderForces
 from .process_search import MOST_STEPS, Processes, ProcessSearch, prior_log_density
 from .regression import LEAST_PRECISION, Priors, Regression, Solution, integrate_out_last
 
+ANY_TIME = (1e-6, 1e6)
+"""Bounds of a correlation time on which nothing depends, as all trials are at rest [s]."""
+
 
 @dataclass(frozen=True, eq=False)
 class Linearisation:
@@ -46,7 +49,12 @@ class Linearisation:
 
     @cached_property
     def correlation_time_range(self) -> tuple[float, float]:
-        """The bounds of a correlation time [s]: shortest sampling interval, longest record."""
+        """The bounds of a correlation time [s]: shortest sampling interval, longest record.
+
+        Forces at rest have no correlation time, so that without trials in motion it has no bounds.
+        """
+        if not self.in_motion:
+            return ANY_TIME
         return correlation_time_range([linear_trial.trial for linear_trial in self.in_motion])
 
     @property

@@ -226,16 +226,27 @@ class RestUnderForces:
         diagonals = np.diagonal(self._factor, axis1=1, axis2=2)
         return whitened_columns.T @ whitened_columns, float(np.sum(np.log(diagonals)))
 
+    @cached_property
+    def _whitened_by_force(self) -> FloatArray:
+        """The whitened residuals (N, C, M) by missing forces of one standard deviation."""
+        return np.asarray(np.linalg.solve(self._factor, self._residual_by_force))
+
+    def forces_of_residual(self, residual: FloatArray) -> dict[int, FloatArray]:
+        """Return the missing force (N,) by port that is estimated from a residual (N, C)."""
+        # With the residual r = B f + noise and f in standard deviations, its mean is
+        # B^T (I + B B^T)^-1 r.
+        whitened = np.linalg.solve(self._factor, residual[:, :, None])[:, :, 0]
+        forces = np.einsum("ncm,nc->nm", self._whitened_by_force, whitened) * self._deviations
+        return dict(zip(self.processes, forces.T, strict=True))
+
     def smooth(self, unknowns: FloatArray) -> SmoothedTrial:
         """Return the positions and forces of the trial at values of the unknowns."""
         linear_trial = self.linear_trial
         trial = linear_trial.trial
         weights = np.concatenate(([1.0], unknowns))
-        # f given the residual r = B f + noise, in standard deviations: mean B^T (I + B B^T)^-1 r
-        by_force = np.linalg.solve(self._factor, self._residual_by_force)
-        residual = np.linalg.solve(self._factor, (linear_trial.columns @ weights)[:, :, None])
-        missing = np.einsum("ncm,nc->nm", by_force, residual[:, :, 0]) * self._deviations
-        explained_shares = np.einsum("ncm,ncm->nm", by_force, by_force)
+        missing_forces = self.forces_of_residual(linear_trial.columns @ weights)
+        missing = np.column_stack([*missing_forces.values()])
+        explained_shares = np.sum(self._whitened_by_force**2, axis=1)
         deviations = self._deviations * np.sqrt(np.maximum(1.0 - explained_shares, 0.0))
         own_forces = linear_trial.force_by_own_force[:, :, list(self.processes)]
         forces = linear_trial.force_by_weight @ weights
@@ -248,7 +259,7 @@ class RestUnderForces:
             trajectory=trial.trajectory_at(
                 positions, {port: forces[:, port] for port in acting_ports}
             ),
-            missing_forces=dict(zip(self.processes, missing.T, strict=True)),
+            missing_forces=missing_forces,
             missing_force_deviations=dict(zip(self.processes, deviations.T, strict=True)),
             effect_forces=linear_trial.effect_forces,
             local=unknowns[len(linear_trial.shared) + len(linear_trial.effect) :],

@@ -8,7 +8,7 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
-from discrepancy.campaign.records import FloatArray
+from discrepancy.campaign.records import FloatArray, TrialKind
 from discrepancy.fits.candidate import PARAMETER_STEP, Candidate, Point, with_step
 from discrepancy.fits.problem import Problem
 from discrepancy.trials_in_motion.effects import HALF_DIFFERENCE, EffectLaws
@@ -32,11 +32,11 @@ motion, see `LawArguments`."""
 def can_estimate_forces(problem: Problem) -> bool:
     """Return whether missing forces can be estimated in a problem.
 
-    That needs trials in motion, and a model that describes how its ports move.
+    That needs a model that describes how its ports move, and trials other than missions.
     """
     model = problem.model
-    has_motion = any(data.trial.is_dynamic for data in problem.trials)
-    return has_motion and model.shows_ports and bool(model.ports)
+    has_missions = any(data.trial.kind is TrialKind.FLIGHT for data in problem.trials)
+    return model.shows_ports and bool(model.ports) and not has_missions
 
 
 class PortedProblem:

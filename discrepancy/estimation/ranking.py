@@ -44,12 +44,15 @@ the motion it is larger than on average."""
 
 OnProgress = Callable[[str], None]
 """Called with a line for the progress display."""
+OnEstimates = Callable[[list[Estimate]], None]
+"""Called with all estimates so far, the most probable first, when there is a new one."""
 
 
 def rank_by_missing_force(
     search: ForceSearch,
     effects: Sequence[Effect],
     on_progress: OnProgress = lambda message: None,
+    on_estimates: OnEstimates = lambda estimates: None,
 ) -> list[Estimate]:
     """Return estimates of hypotheses on the missing force, the most probable first.
 
@@ -60,11 +63,13 @@ def rank_by_missing_force(
     ----------
     on_progress : callable
         The function that receives a line for the progress display, such as the estimate that runs.
+    on_estimates : callable
+        The function that receives the estimates so far, so that an interrupted search keeps them.
     """
     thinned_search = search.thinned
     if thinned_search is None:
-        return rank_hypotheses(search, effects, on_progress)
-    ranked_estimates = rank_hypotheses(thinned_search, effects, on_progress)
+        return rank_hypotheses(search, effects, on_progress, on_estimates)
+    ranked_estimates = rank_hypotheses(thinned_search, effects, on_progress, on_estimates)
     estimates = [search.estimate_without_effects]
     for leading_estimate in _leading_estimates(thinned_search, ranked_estimates, len(effects)):
         on_progress(f"estimating {leading_estimate.candidate.description} in all samples")
@@ -78,6 +83,7 @@ def rank_hypotheses(
     search: ForceSearch,
     effects: Sequence[Effect],
     on_progress: OnProgress = lambda message: None,
+    on_estimates: OnEstimates = lambda estimates: None,
     largest_set: int | None = None,
 ) -> list[Estimate]:
     """Return estimates of hypotheses, the most probable first.
@@ -88,12 +94,12 @@ def rank_hypotheses(
 
     Parameters
     ----------
-    on_progress : callable
-        The function that receives a line for the progress display, such as the estimate that runs.
+    on_progress, on_estimates : callable
+        See `rank_by_missing_force`.
     largest_set : int, optional
         The largest number of effects in a set; by default the length of `ROUGH_COUNTS`.
     """
-    ranking = _Ranking(search, effects, on_progress)
+    ranking = _Ranking(search, effects, on_progress, on_estimates)
     best_estimate = search.estimate_without_effects
     counts_by_length = list(zip(ROUGH_COUNTS, BEAM_WIDTHS, strict=True))
     for rough_count, beam_width in counts_by_length[:largest_set]:
@@ -126,11 +132,16 @@ class _Ranking:
     """The estimates of a ranking, one for each set of effects."""
 
     def __init__(
-        self, search: ForceSearch, effects: Sequence[Effect], on_progress: OnProgress
+        self,
+        search: ForceSearch,
+        effects: Sequence[Effect],
+        on_progress: OnProgress,
+        on_estimates: OnEstimates,
     ) -> None:
         self.search = search
         self.effects = effects
         self.on_progress = on_progress
+        self.on_estimates = on_estimates
         without_effects = search.estimate_without_effects
         self.by_effects: dict[CandidateKey, Estimate] = {
             without_effects.candidate.key: without_effects
@@ -161,6 +172,7 @@ class _Ranking:
         earlier = self.by_effects.get(key)
         if earlier is None or estimate.log_evidence > earlier.log_evidence:
             self.by_effects[key] = estimate
+            self.on_estimates(self.in_order())
 
     def rough_estimates(self, base: Estimate, rough_count: int) -> list[Estimate]:
         """Return rough estimates of a base with one more effect, the most probable first.
@@ -287,7 +299,9 @@ class _Ranking:
             ),
             "velocity": np.concatenate([trial.trajectory.speeds[:, port] for trial in base.trials]),
         }
-        variable = max(VARIABLES, key=lambda name: variance_along_curve(name, motion[name], force))
+        # at rest the velocity is zero
+        variables = [name for name in VARIABLES if np.any(motion[name])]
+        variable = max(variables, key=lambda name: variance_along_curve(name, motion[name], force))
         values = motion[variable]
         estimates = []
         for correlation_length in CORRELATION_LENGTHS:

@@ -83,8 +83,8 @@ def reach_verdict(
 def comparison_of(search: Search) -> ForceComparison | SimulationComparison:
     """Return the comparison of the hypotheses of a search.
 
-    Hypotheses on trials in motion were estimated with the force that they leave missing; others are
-    compared by their simulations.
+    Hypotheses that were estimated with the force that they leave missing are compared by these
+    estimates, others by their simulations.
     """
     if search.force_estimates and search.force_search is not None:
         return ForceComparison(search, search.force_search)

@@ -289,7 +289,8 @@ def _forces_by_trial(
     port, and `recorded` has the trials as they were recorded, by name.
     """
     trial_forces = []
-    for smoothed_trial in estimate.in_motion.trials:
+    # the few load steps at rest tell little beside records in motion
+    for smoothed_trial in estimate.in_motion.trials or estimate.trials:
         trial = smoothed_trial.trial
         samples = slice(None, None, trial.substeps)
         law_force = smoothed_trial.effect_forces[port][samples] if has_law else None
@@ -312,7 +313,8 @@ def _forces_by_trial(
 def _inputs_and_rates(trial: Trial, stride: int) -> dict[str, FloatArray]:
     """Return the recorded inputs of a trial and their rates, at every `stride`-th sample.
 
-    Without inputs they are the applied force and its rate, or nothing if that is zero.
+    Without inputs they are the applied force and its rate, or nothing if that is zero. At rest
+    there are no rates.
     """
     inputs = {f"the input {item.name!r}": item.values for item in trial.inputs}
     if not inputs and np.any(trial.force):
@@ -320,7 +322,8 @@ def _inputs_and_rates(trial: Trial, stride: int) -> dict[str, FloatArray]:
     variables = {}
     for name, values in inputs.items():
         variables[name] = values[::stride]
-        variables[RATE_OF + name] = np.gradient(values, trial.time)[::stride]
+        if trial.is_dynamic:
+            variables[RATE_OF + name] = np.gradient(values, trial.time)[::stride]
     return variables
 
 
@@ -408,6 +411,8 @@ def _with_history_of_motion(trial_forces: Sequence[TrialForce]) -> list[TrialFor
     by at least `TIED_SHARE`: with a short or long relaxation time it is nearly velocity or
     displacement.
     """
+    if not any(np.any(trial.speed) for trial in trial_forces):
+        return list(trial_forces)  # at rest there is no history in time
     shares, _ = _explanatory_variables_of_trials(trial_forces)
     force = np.concatenate([trial.force for trial in trial_forces])
     interval = min(float(np.median(np.diff(trial.time))) for trial in trial_forces)

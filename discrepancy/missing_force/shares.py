@@ -9,7 +9,7 @@ import numpy as np
 
 from discrepancy.campaign.records import FloatArray
 from discrepancy.estimation.estimate import NO_EFFECTS, Estimate
-from discrepancy.estimation.filtered import FilteredTrial, SmoothedTrial
+from discrepancy.estimation.filtered import SmoothedTrial
 from discrepancy.estimation.force_search import ForceSearch
 from discrepancy.estimation.gauss_newton import (
     EstimatorStart,
@@ -21,7 +21,6 @@ from discrepancy.estimation.ported_problem import WIDE_WINDOW
 from discrepancy.estimation.process_search import Processes
 from discrepancy.estimation.trial_set import TrialSet
 from discrepancy.fits.candidate import Point
-from discrepancy.trials_in_motion.trial import PortedTrial
 from discrepancy.trials_in_motion.trial_at_rest import LinearTrial
 
 from .gap_share import OF_FORCE, OF_PREDICTIONS, SEED, GapShare
@@ -64,7 +63,7 @@ class ForceShares:
     def __init__(self, search: ForceSearch) -> None:
         self.search = search
         campaign = search.ported.problem.campaign
-        held_out = tuple(trial for trial in campaign.held_out if trial.is_dynamic)
+        held_out = tuple(campaign.held_out)
         self._held_out: TrialSet | None = None
         self._held_out_trials: dict[bytes, tuple[LinearTrial, ...]] = {}
         self._without_effect: dict[bool, tuple[SmoothedTrial, ...]] = {}
@@ -76,7 +75,7 @@ class ForceShares:
 
     @property
     def has_held_out(self) -> bool:
-        """Whether some of the trials in motion are held out."""
+        """Whether some of the trials are held out."""
         return self._held_out is not None
 
     def gap_share(self, estimate: Estimate, *, held_out: bool) -> GapShare:
@@ -151,23 +150,18 @@ class ForceShares:
             The sums of each block of all trials: of weighted forces, and of changes of readings
             divided by their noise.
         """
-        system = linearisation.in_motion[0].trial.system
-        weights = {}
-        for port in trials[0].missing_forces:
-            strength_on_state = np.linalg.norm(system.actions[port])
-            strength_on_readings = np.linalg.norm(system.through[port])
-            weights[port] = float(np.hypot(strength_on_state, strength_on_readings))
+        weights = {
+            port: trials[0].trial.strength_of_port(port) for port in trials[0].missing_forces
+        }
         of_forces = []
         of_predictions = []
-        processes = self._large_processes(estimate)
-        for smoothed_trial, without_effect, linear_trial in zip(
-            trials, trials_without, linearisation.in_motion, strict=True
+        filters = linearisation.filter(self._large_processes(estimate))
+        for smoothed_trial, without_effect, filtered_trial in zip(
+            trials, trials_without, filters, strict=True
         ):
-            trial = linear_trial.trial
-            filtered_trial = FilteredTrial(linear_trial, processes)
+            trial = smoothed_trial.trial
             # missing forces as they would be estimated from noise alone
-            noise_states, _ = filtered_trial.smooth_residual(_simulated_noise(trial))
-            noise_forces = filtered_trial.missing_forces(noise_states)
+            noise_forces = filtered_trial.forces_of_residual(_simulated_noise(trial))
             # in the order of `_BlockSums`: without a law, with the law, and of noise alone
             forces_of_kinds: tuple[PortForces, ...] = (
                 without_effect.missing_forces,
@@ -223,8 +217,9 @@ class ForceShares:
         """
         processes = self._large_processes(estimate)
         if not held_out:
-            in_motion = estimate.in_motion.linearisation
-            return in_motion, in_motion.smooth(processes, estimate.solution)
+            return estimate.linearisation, estimate.linearisation.smooth(
+                processes, estimate.solution
+            )
         assert self._held_out is not None
         priors = self.search.ported.shared_priors
         trials = self._held_out_linearised_as(estimate)
@@ -305,7 +300,7 @@ def _rms(values: FloatArray) -> float:
     return float(np.sqrt(np.mean(values**2)))
 
 
-def _simulated_noise(trial: PortedTrial) -> FloatArray:
+def _simulated_noise(trial: LinearTrial) -> FloatArray:
     """Return simulated noise (N, C) of a trial with its correlation, divided by its deviation.
 
     The seed is fixed, so that results can be repeated.

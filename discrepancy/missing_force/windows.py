@@ -102,7 +102,6 @@ def _windows_of_missing_force(
     # no windows without a missing force
     if estimate.leaves_no_force:
         return ()
-    estimate = estimate.in_motion
     process = estimate.processes[port_number]
     if leaves_no_force:
         best_events = force_in_records(estimate.linearisation, port_number, process)
@@ -267,7 +266,7 @@ def _port_or_channel_error(
     estimate : Estimate
         The more probable of both.
     """
-    linearisation = at_port.in_motion.linearisation
+    linearisation = at_port.linearisation
     trials = [linear_trial.trial for linear_trial in linearisation.in_motion]
     longest_duration = max(float(np.ptp(trial.time)) for trial in trials)
     best_port = port

@@ -364,7 +364,9 @@ class Search(FittedCandidates):
         Sets that can imitate nearly anything are ranked, but not fitted.
         """
         force_search.begin_along_simulation(self.no_effect.point)
-        self.force_estimates = rank_by_missing_force(force_search, self.effects, self.on_progress)
+        self.force_estimates = rank_by_missing_force(
+            force_search, self.effects, self.on_progress, on_estimates=self._keep_estimates
+        )
         best_estimate = next(
             estimate
             for estimate in self.force_estimates
@@ -377,6 +379,10 @@ class Search(FittedCandidates):
             if fit is not None:
                 self.record_fit(fit, exact=True)
         self.refine_time_steps()
+
+    def _keep_estimates(self, estimates: list[Estimate]) -> None:
+        """Keep the estimates so far, which are what is known if the search is interrupted."""
+        self.force_estimates = estimates
 
     def add_effects(self) -> None:
         """Add one effect at a time to the best set, as long as the score rises.

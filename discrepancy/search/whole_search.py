@@ -29,10 +29,10 @@ def search(
 ) -> Search:
     """Search the catalogue for the set of effects that explains a campaign.
 
-    The model without effect is fitted first. If there are trials in motion, and each trial has at
-    least as many channels as the model has ports, sets of effects are compared by the force that
-    they leave missing. Otherwise, or if that force cannot be estimated, single effects are fitted
-    to the readings, then sets.
+    The model without effect is fitted first. If the model has ports, and each trial at least as
+    many channels, sets of effects are compared by the force that they leave missing. Otherwise, in
+    missions, or if that force cannot be estimated, single effects are fitted to the readings, then
+    sets.
 
     Parameters
     ----------

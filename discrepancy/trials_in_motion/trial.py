@@ -412,6 +412,12 @@ class PortedTrial:
             readings -= np.outer(force[:: self.substeps], system.through[port])
         return np.asarray(readings)
 
+    def strength_of_port(self, port: int) -> float:
+        """Return how strongly a force at a port acts on states and readings, as a weight."""
+        strength_on_state = np.linalg.norm(self.system.actions[port])
+        strength_on_readings = np.linalg.norm(self.system.through[port])
+        return float(np.hypot(strength_on_state, strength_on_readings))
+
     def readings_of_forces_in_block(
         self, forces: Mapping[int, FloatArray], begin: int, end: int
     ) -> FloatArray:

@@ -11,6 +11,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import groupby
+from typing import ClassVar
 
 import numpy as np
 
@@ -26,7 +27,7 @@ from fe.runtime.port_laws import port_laws
 
 from .ported_trial import gain_unknowns, residual_and_derivatives
 from .trajectory import Trajectory
-from .trial import GainUnknown, PortedTrial
+from .trial import ColouredNoise, GainUnknown, PortedTrial
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,6 +79,7 @@ class TrialAtRest:
     is_at_rest = True
     stride = 1
     substeps = 1
+    coloured_noises: ClassVar[Sequence[ColouredNoise]] = ()
 
     @property
     def ports(self) -> tuple[str, ...]:
@@ -154,6 +156,16 @@ class TrialAtRest:
         for port, force in forces.items():
             readings -= force[:, None] * response.outputs_by_force[:, port]
         return readings
+
+    def strength_of_port(self, port: int) -> float:
+        """Return how strongly a force at a port acts on the readings, as a weight."""
+        return float(np.linalg.norm(self.response.outputs_by_force[:, port]))
+
+    def readings_of_forces_in_block(
+        self, forces: Mapping[int, FloatArray], begin: int, end: int
+    ) -> FloatArray:
+        """Return the readings (B, C) by forces in a block of B load steps, over the noise."""
+        return self.readings_of_forces(self.response, forces)[begin:end]
 
     def readings_of_state(self, states: FloatArray, forces: Mapping[int, FloatArray]) -> FloatArray:
         """Return `readings_of_forces`; a trial at rest has no states."""

@@ -332,7 +332,7 @@ def test_a_member_of_a_group_is_no_name(applied_member):
 
 def test_a_member_of_a_group_has_the_parameters_of_its_own_fit(applied_member):
     name, hypotheses = applied_member.name, applied_member.group.verdict.hypotheses
-    (hypothesis,) = [item for item in hypotheses if item.identifiers == (name,)]
+    hypothesis = next(item for item in hypotheses if item.identifiers == (name,))
     assert [effect.identifier for effect in applied_member.patch.effects] == [name]
     assert applied_member.patch.parameters == hypothesis.parameters
 

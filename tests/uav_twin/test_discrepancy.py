@@ -9,7 +9,6 @@ from pathlib import Path
 import pytest
 
 from discrepancy.files.verdict import read_patch, read_verdict_file
-from discrepancy.search.strategy import Search
 from tests.command_line import command, refused, said
 
 MODEL = "single_mass_rig"
@@ -130,7 +129,7 @@ class InterruptedSearch:
         self.kept = out / "verdict_so_far.json"
         self.run = ("discrepancy", "run", campaign, *RIG, "--out", out, "--no-report")
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(Search, "search_sets", interrupt)
+            patch.setattr("discrepancy.estimation.ranking._Ranking.estimate_simpler_forms", interrupt)
             self.sentence = refused(*self.run, code=130)
 
 
