@@ -182,17 +182,17 @@ class LinearSystem:
             return Modes(angular_frequency, shapes, len(angular_frequency))
         # omega^2 (M,), and shapes (displacement_count, M)
         squares, displacement_shapes = self._displacement_modes()
-        n = self.displacement_count
-        count = len(squares)
+        displacement_count = self.displacement_count
+        mode_count = len(squares)
         state_shapes = self._state_shapes()  # (state_count, K)
         state_mode_count = state_shapes.shape[1]
         # displacements and states do not share a mode: two diagonal blocks
-        shapes = np.zeros((self.unknown_count, count + state_mode_count))
-        shapes[:n, :count] = displacement_shapes
-        shapes[n:, count:] = state_shapes
+        shapes = np.zeros((self.unknown_count, mode_count + state_mode_count))
+        shapes[:displacement_count, :mode_count] = displacement_shapes
+        shapes[displacement_count:, mode_count:] = state_shapes
         # modes of states do not oscillate: their frequency is zero
         angular_frequency = np.pad(np.sqrt(np.maximum(squares, 0.0)), (0, state_mode_count))
-        return Modes(angular_frequency, shapes, count)
+        return Modes(angular_frequency, shapes, mode_count)
 
     def _state_shapes(self) -> FloatArray:
         """Return the shapes (state_count, K) of the K independent states that no drive prescribes.

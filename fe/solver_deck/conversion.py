@@ -363,15 +363,15 @@ def _gravity_forces(
     }
     if not accelerations:
         return {}
-    free = jobs.matrices("free", blocks, free=True)
+    matrices_without_supports = jobs.matrices("free", blocks, free=True)
     forces = {}
     for name, acceleration in accelerations.items():
         field = [
             acceleration[axis - 1] if node in jobs.model.mesh.points else 0.0
-            for node, axis in free.dofs
+            for node, axis in matrices_without_supports.dofs
         ]
-        free_forces = free.mass @ np.array(field)
-        forces[name] = _matched_rows(free_forces, free, matrices)
+        free_forces = matrices_without_supports.mass @ np.array(field)
+        forces[name] = _matched_rows(free_forces, matrices_without_supports, matrices)
     return forces
 
 

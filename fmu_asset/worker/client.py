@@ -203,9 +203,9 @@ class WorkerInstance(Instance):
             self._read_into(reply_bytes[filled_bytes : filled_bytes + header.length])
             filled_bytes += header.length
             is_complete = header.kind != Answer.PART
-            # An exception between two parts, such as an interruption, leaves parts of this reply
-            # unread in the pipe, so that no further request can be made. So the instance counts as
-            # lost until the last part has arrived.
+            # If an exception comes between two parts, such as an interruption by the user, the rest
+            # of this reply stays in the pipe, and no further request can be made. Therefore the
+            # instance counts as lost until the last part has arrived.
             self.lost = not is_complete
             report(filled_bytes // bytes_per_step)
 

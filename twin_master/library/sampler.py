@@ -71,9 +71,10 @@ class GridSampler:
             self._start_at(start)
             observations_per_start.append(self._observe(start, next_start))
         observations = np.concatenate(observations_per_start)
-        # Repeat one observation, without a new start. An FMU that settles makes as many steps again
-        # at its last point. An FMU without memory returns to the point of its last start, and the
-        # points in between would change the observation if the FMU remembered them.
+        # Check that an observation depends on its point alone, by repeating one without a new
+        # start. If the FMU settles, it makes as many steps again at its last point: the observation
+        # must not change any more. If it has no memory, it returns to the point of its last start:
+        # an FMU that remembered the points in between would give another observation.
         repeated_point = last - 1 if settles else start
         self._check_repeated_point(repeated_point, observations[repeated_point - first])
         return observations

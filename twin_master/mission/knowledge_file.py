@@ -32,10 +32,13 @@ def save_knowledge(folder: Path, knowledge: Knowledge, number: int | None = None
 
     If the calibration has a record, it is written to a second file.
 
-    The arrays are `predicted` (E, S, U, G), SI, `draws` (E,) and `policy` (S, U); with a policy on
-    the belief also `belief_vectors` (N, S) and `belief_control` (N,), or `risk_beyond_limit` (S,
-    U), `risk_hardest_first` (U,) and `risk_level`; and `true` (E, S, U, G), SI, if the sensors do
-    not show the values of the structure itself.
+    For E draws of the parameter, S states, U controls and G sensors, the arrays are:
+
+    - `predicted` (E, S, U, G), SI, `draws` (E,) and `policy` (S, U);
+    - `belief_vectors` (N, S) and `belief_control` (N,), with a policy that was planned on the
+      belief;
+    - `risk_beyond_limit` (S, U), `risk_hardest_first` (U,) and `risk_level`, with a policy by risk;
+    - `true` (E, S, U, G), SI, if the sensors do not show the values of the structure itself.
 
     Parameters
     ----------
