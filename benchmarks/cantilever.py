@@ -27,6 +27,7 @@ from fe.runtime.patch import (
     INTERNAL_FORCES,
     GaugeOffset,
     InertiaRelief,
+    InterfaceCompliance,
     LoadGain,
     LoadOffset,
     LoadPlace,
@@ -59,6 +60,8 @@ REGIONS = {"inner": (0.2, 0.4), "outer": (0.8, 1.1)}
 """First and last station [m] of the damage regions of `CantileverWithRegions`."""
 GAUGES = {"strain[0]": 0.25, "strain[1]": 0.85, "strain[2]": 1.35}  # m
 STEP = LENGTH / ELEMENTS
+JOINT_ELEMENT = ELEMENTS // 4
+"""Element with the joint of `CantileverWithRegions`."""
 SIZE = 2 * ELEMENTS + 1  # root rotation, then displacement and rotation of each node
 
 
@@ -132,6 +135,10 @@ def _system(modulus: float, structural: ModelPatch) -> LinearSystem:
             extra += primitive.mass * np.outer(row, row)
         elif isinstance(primitive, SupportCompliance):
             compliance += primitive.compliance
+        elif isinstance(primitive, InterfaceCompliance):
+            # a hinge in series with the bending compliance of the element in which it lies
+            softness = primitive.compliance * BENDING_STIFFNESS / STEP
+            loss[JOINT_ELEMENT] = 1.0 - 1.0 / (1.0 / (1.0 - loss[JOINT_ELEMENT]) + softness)
     stiffness = np.zeros((SIZE, SIZE))
     h = STEP
     k = (
@@ -245,10 +252,11 @@ class Cantilever(Model):
 
 
 class CantileverWithRegions(Cantilever):
-    """The cantilever as a structure that can lose stiffness in its damage regions alone."""
+    """The cantilever with a joint, as a structure that loses stiffness in damage regions alone."""
 
     name = "cantilever with regions"
     regions = tuple(REGIONS)
+    interface_motions = (("joint", "rs"),)
     stations = None
 
     def supports(self, primitive: type[Primitive]) -> bool:
@@ -272,7 +280,9 @@ def _motion(
     trial: Trial, rows: FloatArray, patch: ModelPatch, conditions: Conditions
 ) -> tuple[FloatArray, FloatArray | None, FloatArray]:
     """Return values and rates (N, C) of rows (C, n), and the torque (N,) of the load."""
-    structural = patch.of(PointMass, PlaceMass, SupportCompliance, LocalStiffnessLoss)
+    structural = patch.of(
+        PointMass, PlaceMass, SupportCompliance, InterfaceCompliance, LocalStiffnessLoss
+    )
     softening = sum(
         primitive.coefficient for primitive in patch if isinstance(primitive, ModulusTemperature)
     )

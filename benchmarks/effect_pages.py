@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.effect_pictures import (
+    EFFECTS_OF_PARTS,
     FLOWS,
-    REGION_LOSSES,
     draw,
     picture_of,
     picture_patch,
@@ -113,7 +113,7 @@ def pages() -> dict[str, str]:
         f"{effect.identifier}.md": page(
             effect,
             texts[effect.identifier],
-            picture_setting(effect) if effect.identifier in (*FLOWS, *REGION_LOSSES) else beam,
+            picture_setting(effect) if effect.identifier in (*FLOWS, *EFFECTS_OF_PARTS) else beam,
         )
         for effect in library()
     }

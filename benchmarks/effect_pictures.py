@@ -21,8 +21,8 @@ FloatArray = NDArray[np.float64]
 RESOLUTION = 88.0
 FLOWS = ("outflow", "overflow")
 """Effects that act on a store, not on a structure."""
-REGION_LOSSES = ("region_stiffness_loss",)
-"""Effects on a structure that can lose stiffness in its damage regions alone."""
+EFFECTS_OF_PARTS = ("region_stiffness_loss", "interface_compliance")
+"""Effects on a structure with damage regions and a joint."""
 
 # Factor and unit of each quantity in a picture.
 UNITS = {
@@ -291,6 +291,9 @@ PICTURES: dict[str, Picture] = {
     "load_direction": Picture({"angle": 0.1}, (load_line("tip"), load_line("g0"))),
     "added_mass": Picture({"mass_ratio": 0.1}, (ringdown(end=1.2), load_line())),
     "support_compliance": Picture({"compliance_share": 0.15}, (load_line("tip"), load_line("g0"))),
+    "interface_compliance": Picture(
+        {"compliance_share": 0.15}, (load_line("tip"), load_line("g0"))
+    ),
     "local_stiffness_loss": Picture(
         {"loss": 0.3, "start_ratio": 0.4, "length_ratio": 0.15}, (ratios("up"), load_line("g1"))
     ),
@@ -393,9 +396,9 @@ def picture_setting(effect: Effect | None = None) -> Setting:
     """Return the setting of a picture: a cantilever, or for flows a tank."""
     if effect is not None and effect.identifier in FLOWS:
         return tank_setting()
-    has_regions = effect is not None and effect.identifier in REGION_LOSSES
+    has_parts = effect is not None and effect.identifier in EFFECTS_OF_PARTS
     cantilever_campaign = campaign()
-    model = CantileverWithRegions() if has_regions else Cantilever()
+    model = CantileverWithRegions() if has_parts else Cantilever()
     return Setting(cantilever_campaign, model, model.scales(cantilever_campaign))
 
 

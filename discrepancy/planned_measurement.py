@@ -2,10 +2,13 @@
 
 Before anything is measured, the gauges, displacements and accelerations of a structure file are the
 channels of a campaign with stated noise, and its forces the trials: static load lines, and releases
-of these loads. `judgement.separability` says what such a campaign can decide.
+of these loads. `judgement.separability` says what such a campaign can decide, and
+`judgement.next_experiment` which measurement beside it would decide more.
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -14,14 +17,35 @@ from discrepancy.campaign.protocol import Release
 from discrepancy.campaign.records import Campaign, Channel, NoiseRecord, Quantity, Trial, TrialKind
 from discrepancy.catalogue.entry import Effect, Setting
 from discrepancy.errors import ModelError
-from discrepancy.fits.candidate import EffectTerm
-from discrepancy.judgement.separability import Detectability, Separability, compute_separability
+from discrepancy.fits.candidate import Candidate, EffectTerm
+from discrepancy.fits.fitting import CandidateFit, fit
+from discrepancy.fits.problem import Problem
+from discrepancy.fits.screening import Screen
+from discrepancy.judgement.next_experiment import (
+    SENSOR_WORDS,
+    Alternatives,
+    Proposal,
+    Worth,
+    added_load_worths,
+    added_sensor_worths,
+    worth_of_trial,
+)
+from discrepancy.judgement.separability import (
+    CONFUSION_DISTANCE,
+    Confusion,
+    Detectability,
+    Separability,
+    compute_separability,
+)
 from discrepancy.system.structures import StructureModel
 from discrepancy.system.system_state import SystemState
+from fe.reduction.model_cache import changeable_model
 from fe.runtime.patch import ModelPatch
+from fe.structure.design import load_structure
 
 SUSPECTS = (
     "support_compliance",
+    "interface_compliance",
     "added_mass",
     "region_stiffness_loss",
     "load_offset",
@@ -39,6 +63,10 @@ RELEASED_SHARE = 0.5
 """Force of a release over the largest one."""
 RELEASE_DEVIATION = 0.02
 """Standard deviation of the displacement of a release, as a fraction of it."""
+MOST_PLACES = 4
+"""Largest number of places at which a suspicion is compared with one that looks like it."""
+COST_OF_RELEASE = 1.0
+"""Cost of a release, see `Proposal.cost`."""
 ZERO_OVER_NOISE = 2.0
 """Standard deviation of a channel's zero over that of its noise."""
 
@@ -56,6 +84,45 @@ class Precision(NamedTuple):
 
     noise: dict[Quantity, float]
     gain: float
+
+
+class Remedy(NamedTuple):
+    """A measurement that would tell two suspicions apart.
+
+    Attributes
+    ----------
+    description : str
+        The measurement in words.
+    worth : Worth
+        What it is expected to tell, if both suspicions are equally probable before it.
+    cost : float
+        The cost as in `Proposal.cost`.
+    """
+
+    description: str
+    worth: Worth
+    cost: float
+
+    @property
+    def rank(self) -> tuple[float, float]:
+        """The key by which measurements are sorted: certainty to two digits, then the cost."""
+        return (-round(self.worth.certainty, 2), self.cost)
+
+
+class LookAlikes(NamedTuple):
+    """Two suspicions that planned trials do not tell apart, and what would.
+
+    Attributes
+    ----------
+    terms : (EffectTerm, EffectTerm)
+        The suspicions with the places at which they are compared.
+    remedies : tuple of Remedy
+        Additional measurements, those that tell most first: at most a gauge, a displacement sensor,
+        a load at another place and a release.
+    """
+
+    terms: tuple[EffectTerm, EffectTerm]
+    remedies: tuple[Remedy, ...]
 
 
 class Plan(NamedTuple):
@@ -85,52 +152,154 @@ class Plan(NamedTuple):
         return row.effect.patch(self.setting, values, row.place)
 
 
-def plans_of(
-    model: StructureModel, precision: Precision, catalogue: Sequence[Effect]
-) -> tuple[Plan, Plan]:
-    """Return what static loads can decide, and what static loads together with releases can.
+def load_plannable_structure(file: Path) -> StructureModel:
+    """Return the model of a structure file on which a measurement can be planned.
+
+    Raises
+    ------
+    ModelError
+        If the structure has no force, or nothing that is read at rest. This is said before the
+        structure is reduced.
+    FiniteElementError
+        If the structure cannot be read, modelled or reduced.
+    """
+    design = load_structure(file)
+    if all(control.unit != "N" for control in design.control):
+        raise ModelError(
+            f"The structure {design.name} has no control in N: a planned load line needs one; give "
+            'a [[control]] with unit = "N" and a [[load]] tied to it.'
+        )
+    if not design.gauge and not design.displacement:
+        raise ModelError(
+            f"The structure {design.name} has neither a gauge nor a displacement, which a planned "
+            "load line would be read by: give a [[gauge]] or a [[displacement]]."
+        )
+    return StructureModel(changeable_model(file))
+
+
+class PlannedMeasurement:
+    """What planned trials on a structure can decide, and what would decide more.
 
     Parameters
     ----------
     model : StructureModel
-        The structure with the changes that it may have.
+        The structure with the changes that it may have, from `load_plannable_structure`.
     precision : Precision
         How precise the channels are.
     catalogue : sequence of Effect
         The catalogue; only the effects among `SUSPECTS` are compared.
 
-    Raises
-    ------
-    ModelError
-        If the structure has no force, or nothing that is read at rest.
+    Attributes
+    ----------
+    static, with_releases : Plan
+        What static loads can decide, and what these together with releases can.
     """
-    if not model.forces:
-        raise ModelError(
-            f"The structure {model.name} has no control in N: a planned load line needs one; give "
-            'a [[control]] with unit = "N" and a [[load]] tied to it.'
-        )
-    if set(model.quantities.values()) <= {Quantity.ACCELERATION}:
-        raise ModelError(
-            f"The structure {model.name} has neither a gauge nor a displacement, which a planned "
-            "load line would be read by: give a [[gauge]] or a [[displacement]]."
-        )
-    suspects = [effect for effect in catalogue if effect.identifier in SUSPECTS]
-    lines = _load_lines(model)
-    static = _plan(model, precision, lines, suspects)
-    with_releases = _plan(model, precision, [*lines, *_releases(model)], suspects)
-    return static, with_releases
 
+    def __init__(
+        self, model: StructureModel, precision: Precision, catalogue: Sequence[Effect]
+    ) -> None:
+        self._suspects = [effect for effect in catalogue if effect.identifier in SUSPECTS]
+        self._lines = _load_lines(model)
+        self._releases = _releases(model)
+        self._model = model
+        self._precision = precision
+        self.static = self._plan(self._lines)
+        self.with_releases = self._plan([*self._lines, *self._releases])
 
-def _plan(
-    model: StructureModel,
-    precision: Precision,
-    trials: Sequence[Trial],
-    suspects: Sequence[Effect],
-) -> Plan:
-    """Return what planned trials can decide of some suspicions."""
-    campaign = _campaign_of(model, precision, trials)
-    setting = Setting(campaign, model, model.scales(campaign))
-    return Plan(setting, compute_separability(campaign, model, setting, suspects))
+    def _plan(self, trials: Sequence[Trial]) -> Plan:
+        """Return what some of the planned trials can decide."""
+        campaign = _campaign_of(self._model, self._precision, trials)
+        setting = Setting(campaign, self._model, self._model.scales(campaign))
+        separability = compute_separability(campaign, self._model, setting, self._suspects)
+        return Plan(setting, separability)
+
+    @property
+    def confusions(self) -> list[tuple[Confusion, Plan]]:
+        """The pairs of suspicions that static loads do not tell apart, with the plan that shows it.
+
+        If releases do not tell a pair apart either, it is that of the plan with releases, which has
+        the places at which they do not.
+        """
+        with_releases = {pair.effects: pair for pair in self.with_releases.separability.confusions}
+        return [
+            (with_releases[pair.effects], self.with_releases)
+            if pair.effects in with_releases
+            else (pair, self.static)
+            for pair in self.static.separability.confusions
+        ]
+
+    def look_alikes(self, confusion: Confusion, plan: Plan) -> LookAlikes:
+        """Return two suspicions with the measurements that tell them apart, best first.
+
+        Both are equally probable before, at the places at which they explain the load lines.
+
+        Parameters
+        ----------
+        confusion, plan
+            A pair of `confusions`.
+        """
+        problem, fits = self._fits_to_load_lines(confusion, plan.setting)
+        other_count = len(fits) - 1
+        alternatives = Alternatives(
+            fits=fits,
+            weights=np.array([0.5, *[0.5 / other_count] * other_count]),
+            classes=np.array([0, *[1] * other_count]),
+        )
+        remedies = []
+        for sensor, proposal, worth in added_sensor_worths(problem, alternatives):
+            words = f"{SENSOR_WORDS[sensor.channel.quantity]} at {sensor.channel.name}"
+            remedies.append(Remedy(words, worth, proposal.cost))
+        for proposal, worth in added_load_worths(problem, alternatives):
+            words = f"a load at {proposal.trial.load_place}"
+            remedies.append(Remedy(words, worth, proposal.cost))
+        releases = []
+        for trial in self._releases:
+            proposal = Proposal(trial, f"a {trial.name}", "", COST_OF_RELEASE)
+            worth = worth_of_trial(problem, proposal, alternatives)
+            releases.append(Remedy(proposal.description, worth, proposal.cost))
+        remedies.append(min(releases, key=lambda remedy: remedy.rank))
+        truth, first_other, *_ = [fit.candidate.terms[0] for fit in fits]
+        return LookAlikes(
+            terms=(truth, first_other),
+            remedies=tuple(sorted(remedies, key=lambda remedy: remedy.rank)),
+        )
+
+    def _fits_to_load_lines(
+        self, confusion: Confusion, setting: Setting
+    ) -> tuple[Problem, list[CandidateFit]]:
+        """Return the load lines as read under one suspicion, and the fits of both to them.
+
+        The first fit is that of the suspicion that is true. Those of the other one, at each of its
+        places where it explains the readings nearly as well, follow the best first.
+        Sensors that are read in releases alone, and errors of the mesh in frequencies, are unknowns
+        of the problem, too.
+        """
+        campaign = self.with_releases.setting.campaign
+        problem = Problem(campaign, self._model, setting).with_trials(self._lines)
+        truth = Candidate((confusion.true_term,))
+        start = replace(problem.prior_mean_point(truth), effect=confusion.true_values)
+        lines = []
+        for number, line in enumerate(self._lines):
+            response = problem.response_of_candidate(number, start, truth)
+            lines.append(replace(line, values=problem.prediction(number, start, response)))
+        problem = problem.with_trials(lines)
+        screen = Screen(problem, fit(problem, Candidate(), problem.prior_mean_point(Candidate())))
+        # the other suspicion where it explains most
+        best_of_places = []
+        for place in confusion.other_effect.places(setting):
+            changes = list(screen.changes_on_grid(EffectTerm(confusion.other_effect, place)))
+            if changes:
+                best_of_places.append(max(changes, key=lambda change: change.gain))
+        best_of_places.sort(key=lambda change: -change.gain)
+        fits = []
+        for change in best_of_places[:MOST_PLACES]:
+            other = Candidate((change.term,))
+            start_of_other = replace(problem.prior_mean_point(other), effect=change.best_values)
+            fits.append(fit(problem, other, start_of_other))
+        fits.sort(key=lambda other_fit: other_fit.objective)
+        limit = fits[0].objective + 0.5 * CONFUSION_DISTANCE
+        alike = [other_fit for other_fit in fits if other_fit.objective <= limit]
+        return problem, [fit(problem, truth, start), *alike]
 
 
 def _campaign_of(model: StructureModel, precision: Precision, trials: Sequence[Trial]) -> Campaign:

@@ -1,19 +1,22 @@
 """`uav-twin structure suspects`: what a planned measurement would tell apart."""
 
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from reporting import terminal
 from reporting.progress import stage
 from reporting.terminal import JsonOption
-from reporting.words import listing, number
+from reporting.words import capital, listing, number
 from uav_twin.options import StructureArgument
 from uav_twin.structure import find_structure
 
 if TYPE_CHECKING:
     from discrepancy.judgement.separability import Detectability
-    from discrepancy.planned_measurement import Plan
+    from discrepancy.planned_measurement import LookAlikes, Plan
+
+LEAST_CERTAINTY = 0.75
+"""Certainty from which a measurement is said to tell two suspicions apart."""
 
 
 def suspects(
@@ -35,28 +38,34 @@ def suspects(
 ) -> None:
     """Print which faults the planned gauges of a structure could tell apart.
 
-    The faults are yielding supports, masses, losses of stiffness, displaced or turned loads, turned
-    gauges and wrong gains, first under static loads alone and then with releases, too.
+    The faults are yielding supports and interfaces, masses, losses of stiffness, displaced or
+    turned loads, turned gauges and wrong gains, first under static loads alone and then with
+    releases, too. Of those that look alike it says which further measurement tells them apart.
 
     Example: `uav-twin structure suspects arm.toml --strain-noise 2`
     """
     from discrepancy.campaign.records import Quantity
     from discrepancy.catalogue.library import library
-    from discrepancy.planned_measurement import Precision, plans_of
-    from discrepancy.system.structures import StructureModel
-    from fe.reduction.model_cache import changeable_model
+    from discrepancy.planned_measurement import (
+        PlannedMeasurement,
+        Precision,
+        load_plannable_structure,
+    )
 
     noise = {
         Quantity.STRAIN: 1e-6 * strain_noise,
         Quantity.DISPLACEMENT: 1e-3 * displacement_noise,
         Quantity.ACCELERATION: acceleration_noise,
     }
-    model = StructureModel(changeable_model(find_structure(file)))
+    model = load_plannable_structure(find_structure(file))
     with stage("What the planned measurement can decide"):
-        static, with_releases = plans_of(model, Precision(noise, 0.01 * gain), library())
-    rows = _rows(static, with_releases)
+        measurement = PlannedMeasurement(model, Precision(noise, 0.01 * gain), library())
+    with stage("Which measurement would decide more"):
+        look_alikes = [measurement.look_alikes(*pair) for pair in measurement.confusions]
+    rows = _rows(measurement.static, measurement.with_releases)
     if json:
-        terminal.print_json({"suspicions": rows})
+        pairs = [_record_of_pair(pair) for pair in look_alikes]
+        terminal.print_json({"suspicions": rows, "look_alikes": pairs})
         return
     terminal.print_table(
         (
@@ -68,6 +77,46 @@ def suspects(
         ),
         [list(row.values()) for row in rows],
     )
+    for pair in look_alikes:
+        terminal.say(_sentence_on_pair(pair))
+    if look_alikes:
+        terminal.say(
+            "In brackets: the probability that the right one of both is then the more probable "
+            "one; 0.5 is a guess."
+        )
+
+
+def _record_of_pair(pair: "LookAlikes") -> dict[str, Any]:
+    """Return the record of two suspicions that look alike, with what would tell them apart."""
+    return {
+        "suspicions": [term.effect.name for term in pair.terms],
+        "places": [term.place for term in pair.terms],
+        "measurements": [
+            {
+                "measurement": remedy.description,
+                "certainty": remedy.worth.certainty,
+                "information_nat": remedy.worth.information,
+            }
+            for remedy in pair.remedies
+        ],
+    }
+
+
+def _sentence_on_pair(pair: "LookAlikes") -> str:
+    """Return the sentence on two suspicions that look alike and what would tell them apart."""
+    names = listing(f"{term.effect.name} ({term.place})" for term in pair.terms)
+    texts = [
+        f"{remedy.description} ({remedy.worth.certainty:.2f})"
+        for remedy in pair.remedies
+        if remedy.worth.certainty >= LEAST_CERTAINTY
+    ]
+    if not texts:
+        best = pair.remedies[0]
+        return (
+            f"{capital(names)} look alike, and no single measurement here tells them apart: the "
+            f"best is {best.description} ({best.worth.certainty:.2f})."
+        )
+    return f"{capital(names)} look alike; {listing(texts, joint='or')} tells them apart."
 
 
 def _rows(static: "Plan", with_releases: "Plan") -> list[dict[str, str]]:
@@ -80,6 +129,8 @@ def _rows(static: "Plan", with_releases: "Plan") -> list[dict[str, str]]:
     for at_rest, released in zip(
         static.separability.detectability, with_releases.separability.detectability, strict=True
     ):
+        if at_rest.reason and released.reason:
+            continue  # the structure has no place for it
         shown = released if at_rest.reason else at_rest
         rows.append(
             {
@@ -105,14 +156,14 @@ def _look_alikes(plan: "Plan", detectability: "Detectability") -> str:
 def _least_size(plan: "Plan", detectability: "Detectability") -> str:
     """Return the smallest size of a suspicion that a plan shows, with its unit."""
     from discrepancy.files.verdict import primitive_intervals
-    from fe.runtime.patch import SupportCompliance
+    from fe.runtime.patch import InterfaceCompliance, SupportCompliance
 
     patch = plan.least_change(detectability)
     if patch is None:
         return "never seen"
     (change, *_) = patch
-    if isinstance(change, SupportCompliance):
-        unit = "N/m" if change.motion in "xyz" else "N m/rad"
+    if isinstance(change, SupportCompliance | InterfaceCompliance):
+        unit = "N m/rad" if change.motion.startswith("r") else "N/m"
         return f"a spring of {_two_digits(1.0 / change.compliance)} {unit}"
     size = next(size for size in primitive_intervals(patch) if size.value != 0.0)
     if size.unit == "1":

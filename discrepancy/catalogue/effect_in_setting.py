@@ -25,9 +25,12 @@ MOTION_WORDS = {
     **{axis: f"shift along {axis}" for axis in "xyz"},
     **{f"r{axis}": f"turn about {axis}" for axis in "xyz"},
 }
-"""Words for each motion of a support in the names of places."""
+"""Words for each motion of a support, and of an interface, in the names of places."""
+_AXES_OF_INTERFACES = {"n": "its normal", "s": "its longer extent", "t": "its shorter extent"}
+MOTION_WORDS |= {axis: f"shift along {words}" for axis, words in _AXES_OF_INTERFACES.items()}
+MOTION_WORDS |= {f"r{axis}": f"turn about {words}" for axis, words in _AXES_OF_INTERFACES.items()}
 MOTION_OF_WORDS = {words: motion for motion, words in MOTION_WORDS.items()}
-"""The motion of a support by these words."""
+"""The motion of a support or an interface by these words."""
 PREPOSITIONS = {
     "offsets of loads": "along",
     "tilts of loads": "towards",
@@ -192,7 +195,7 @@ class EffectInSetting:
             return (Target(port, number=(SKINS | SIDES)[skin]),)
         if place == EVERY_PORT:
             return tuple(Target(port) for port in self.state_ports)
-        if self.section.places == "supports":
+        if self.section.places in ("supports", "interfaces"):
             if not place:  # no choice, such as at a wing
                 ((support, motion),) = self.setting.model.support_motions
                 return (Target(support, motion=motion),)
@@ -232,7 +235,7 @@ class Target:
     number : float
         Number in the place's name: the side of a skin, or the frequency of a line [Hz].
     motion : str
-        Motion of a support, such as "rx", or the axis of a change of a load.
+        Motion of a support or an interface, such as "rx", or the axis of a change of a load.
     """
 
     name: str

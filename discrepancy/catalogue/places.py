@@ -80,6 +80,12 @@ def _supports(effect: EffectInSetting) -> Names:
     return tuple(f"{support}, {MOTION_WORDS[motion]}" for support, motion in support_motions)
 
 
+def _interfaces(effect: EffectInSetting) -> Names:
+    """Return the interfaces that may yield, with the motion: "joint, shift along its normal"."""
+    interface_motions = effect.setting.model.interface_motions
+    return tuple(f"{interface}, {MOTION_WORDS[motion]}" for interface, motion in interface_motions)
+
+
 def _changes_of_loads(effect: EffectInSetting, change: str, places: str) -> Names:
     """Return the changes of forces that act in fitted trials, such as "pull, along x".
 
@@ -235,6 +241,7 @@ PLACES: dict[str, Callable[[EffectInSetting], Names]] = {
     "ports of states": lambda effect: effect.state_ports,
     "ports of states, or all": _state_ports_or_all,
     "supports": _supports,
+    "interfaces": _interfaces,
     "offsets of loads": lambda effect: _changes_of_loads(effect, "offset", "offsets of loads"),
     "tilts of loads": lambda effect: _changes_of_loads(effect, "tilt", "tilts of loads"),
     "offsets of gauges": _offsets_of_gauges,
@@ -274,6 +281,7 @@ NO_PLACES = {
     "ports of states": _NO_STATE,
     "ports of states, or all": _NO_STATE,
     "supports": "The model names no support that could yield.",
+    "interfaces": "The model names no interface of two parts that could yield.",
     "offsets of loads": "The model says no place of a load that could be wrong.",
     "tilts of loads": "The model says no direction of a load that could be wrong.",
     "offsets of gauges": "The model knows no strain beside the places of its gauges.",

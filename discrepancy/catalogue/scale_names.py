@@ -201,7 +201,7 @@ def _region_has_gauge(context: BuildContext) -> float:
 
 
 def _support_compliance(context: BuildContext) -> float:
-    """Return the compliance of the support's motion that doubles the structure's compliance."""
+    """Return the compliance of a support's or interface's motion that doubles the structure's."""
     target = context.target
     return context.setting.scales.support_compliance(target.name, target.motion)
 
@@ -238,6 +238,7 @@ SCALES: dict[str, Callable[[BuildContext], float]] = {
     "region_largest_loss": _largest_region_loss,
     "region_has_gauge": _region_has_gauge,
     "support_compliance": _support_compliance,
+    "interface_compliance": _support_compliance,
     "mass_reach": _mass_reach,
     "number": lambda context: context.target.number,
     "port_displacement": lambda context: context.port.displacement,

@@ -18,7 +18,7 @@ from math import inf
 import numpy as np
 
 from discrepancy.campaign.noise import NoiseModel, noise_model, whiteness_is_tested
-from discrepancy.campaign.records import Campaign, FloatArray, IntArray, Trial
+from discrepancy.campaign.records import Campaign, Channel, FloatArray, IntArray, Trial
 from discrepancy.catalogue.entry import Setting
 from discrepancy.errors import CampaignDataError
 from discrepancy.system.interface import Model
@@ -125,6 +125,10 @@ class Problem:
         self.campaign = campaign
         self.setting = setting
         self.model = model.with_response_cache()
+        self._acts_in_motion_alone = np.array(
+            [parameter.name in model.nuisance_parameters for parameter in model.parameters],
+            dtype=bool,
+        )
         self.channel_names = tuple(campaign.channels)
         self.refinement = 1
         self.noise_models: dict[str, NoiseModel] = {}
@@ -264,9 +268,11 @@ class Problem:
             Its time derivative; None if the model does not give it.
         """
         data = self.trials[trial_index]
-        conditions = data.unknowns.conditions(
-            data.trial, self.shared.parameters(shared_values), local_values
-        )
+        parameters = self.shared.parameters(shared_values)
+        if not data.trial.is_dynamic:
+            # of no influence at rest: one response serves all their values
+            parameters[self._acts_in_motion_alone] = 0.0
+        conditions = data.unknowns.conditions(data.trial, parameters, local_values)
         conditions = replace(conditions, refinement=self.refinement * refinement)
 
         def simulate() -> tuple[FloatArray, FloatArray | None]:
@@ -476,20 +482,19 @@ class Problem:
         problem._prepare_trials(trials)
         return problem
 
-    def with_second_sensor(self, channel_name: str, second_name: str) -> "Problem":
-        """Return a problem with a second sensor beside that of a channel, under a name of its own.
+    def with_channel(self, channel: Channel, noise_of: str) -> "Problem":
+        """Return a problem with one more channel, which has the noise of a present one.
 
-        It has the same noise, and no gain error. The trials of the problem do not have it.
+        The trials of the problem do not have it. An error of its gain is none of the shared
+        unknowns.
         """
-        channel = self.campaign.channels[channel_name]
-        second_channel = replace(channel, name=second_name, gain_deviation=0.0)
-        number = self.channel_names.index(channel_name)
+        number = self.channel_names.index(noise_of)
         problem = copy(self)
         problem.campaign = replace(
-            self.campaign, channels={**self.campaign.channels, second_name: second_channel}
+            self.campaign, channels={**self.campaign.channels, channel.name: channel}
         )
-        problem.channel_names = (*self.channel_names, second_name)
-        problem.noise_models = {**self.noise_models, second_name: self.noise_models[channel_name]}
+        problem.channel_names = (*self.channel_names, channel.name)
+        problem.noise_models = {**self.noise_models, channel.name: self.noise_models[noise_of]}
         problem.record_freedom = np.append(self.record_freedom, self.record_freedom[number])
         problem.is_whiteness_tested = [*self.is_whiteness_tested, self.is_whiteness_tested[number]]
         problem.sample_counts = np.append(self.sample_counts, 0.0)

@@ -6,19 +6,20 @@ Ann. Math. Statist. 27, 986-1005), by simulation with a fixed seed.
 """
 
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
 from scipy.special import entr, logsumexp
 
-from discrepancy.campaign.records import FloatArray, Trial, TrialKind
+from discrepancy.campaign.records import Channel, FloatArray, IntArray, Quantity, Trial, TrialKind
 from discrepancy.errors import SENTENCES, DiscrepancyError
 from discrepancy.fits.candidate import Point
 from discrepancy.fits.fitting import CandidateFit
 from discrepancy.fits.normal_equations import check_finite
 from discrepancy.fits.problem import Problem
-from discrepancy.system.interface import NO_PATCH
+from discrepancy.system.interface import NO_PATCH, Model
 from discrepancy.verdict import Experiment
 from fe.runtime.patch import SENSORS, ModelPatch, ModulusTemperature, PointMass
 
@@ -37,11 +38,35 @@ LEAST_PROBABILITY = 1e-3
 FREE_PRECISION = 1e-4
 """Precision of a scaled unknown with a flat prior: a free zero is known to a hundred noise
 deviations."""
+MOST_LOADS = 18
+"""Largest number of other forces that are tried, the first of the model's possible loads."""
+COST_OF_LOAD = 1.5
+"""Cost of a loading at another place."""
 COST_OF_SENSOR = 2.0
 """Cost of a trial with one more sensor, which has to be mounted first."""
+SENSOR_WORDS = {
+    Quantity.STRAIN: "a strain gauge",
+    Quantity.DISPLACEMENT: "a displacement sensor",
+}
+"""The sensors that may be added, in a sentence."""
 LEAST_SINGULAR_VALUE = 1e-6
 """Singular value, relative to the largest, below which a direction in the space of readings is left
 out: all hypotheses predict the same there."""
+
+
+class AddedSensor(NamedTuple):
+    """A sensor that a campaign does not have yet.
+
+    Attributes
+    ----------
+    channel : Channel
+        The channel that it gives. An error of its gain is independent of all others.
+    noise_of : str
+        The channel of the campaign whose noise it has.
+    """
+
+    channel: Channel
+    noise_of: str
 
 
 @dataclass(frozen=True)
@@ -58,8 +83,8 @@ class Proposal:
         The cost relative to one more trial of a kind that was done already.
     added_patch : ModelPatch
         The change of the structure for this trial, such as a mass at the tip.
-    doubled_channel : str
-        The channel beside which a second sensor is mounted for this trial; empty for none.
+    added_sensor : AddedSensor, optional
+        A sensor that is mounted for this trial.
     """
 
     trial: Trial
@@ -67,7 +92,22 @@ class Proposal:
     reason: str
     cost: float
     added_patch: ModelPatch = field(default_factory=ModelPatch)
-    doubled_channel: str = ""
+    added_sensor: AddedSensor | None = None
+
+
+class Worth(NamedTuple):
+    """What a new trial is expected to tell about which hypothesis is right.
+
+    Attributes
+    ----------
+    information : float
+        The mutual information of the hypothesis and the readings [nat].
+    certainty : float
+        The probability that the hypothesis that is most probable after the trial is right.
+    """
+
+    information: float
+    certainty: float
 
 
 def next_experiments(
@@ -94,6 +134,7 @@ def next_experiments(
     probabilities /= probabilities.sum()
     fits = [fit for fit, _ in open_fits]
     is_oscillating = oscillates(problem, fits[0]) if fits else True
+    alternatives = Alternatives.single(fits, probabilities)
     experiments = []
     proposals = [
         *feasible_proposals(problem, is_oscillating=is_oscillating),
@@ -101,12 +142,17 @@ def next_experiments(
     ]
     for proposal in proposals:
         try:
-            information = mutual_information(problem, proposal, fits, probabilities)
+            information = worth_of_trial(problem, proposal, alternatives).information
         except DiscrepancyError:  # the model cannot simulate this trial
             continue
         if information >= least_information:
             experiments.append(
                 Experiment(proposal.description, information, proposal.cost, proposal.reason)
+            )
+    for _, proposal, worth in added_sensor_worths(problem, alternatives) if fits else ():
+        if worth.information >= LEAST_INFORMATION:
+            experiments.append(
+                Experiment(proposal.description, worth.information, proposal.cost, proposal.reason)
             )
     experiments.sort(key=lambda experiment: -experiment.information / experiment.cost)
     return tuple(experiments[:MOST_PROPOSED])
@@ -115,43 +161,85 @@ def next_experiments(
 # ---------------------------------------------------------------- information
 
 
-def mutual_information(
-    problem: Problem, proposal: Proposal, fits: Sequence[CandidateFit], weights: FloatArray
-) -> float:
-    """Return the information that a new trial is expected to give on the hypothesis [nat].
+class Alternatives(NamedTuple):
+    """Hypotheses between which a new trial is to decide.
 
-    It is the mutual information of the hypothesis and the readings of the trial (Lindley 1956, Ann.
-    Math. Statist. 27, 986-1005).
-
-    Parameters
+    Attributes
     ----------
-    proposal : Proposal
-        The proposal with the new trial.
     fits : sequence of CandidateFit
-        The fit of each of the H hypotheses, the most probable first.
+        The fit of each of H hypotheses, the most probable first.
     weights : (H,) array
-        The probabilities of the hypotheses, of sum one.
+        Their probabilities, of sum one.
+    classes : (H,) array of int
+        The class of each, in ascending order. The question is to which class the right hypothesis
+        belongs; members of one class, such as one effect at several places, need not be told apart.
     """
+
+    fits: Sequence[CandidateFit]
+    weights: FloatArray
+    classes: IntArray
+
+    @classmethod
+    def single(cls, fits: Sequence[CandidateFit], weights: FloatArray) -> "Alternatives":
+        """Return hypotheses each of which is a class of its own."""
+        return cls(fits, weights, np.arange(len(fits)))
+
+    def class_log_sums(self, log_posterior: FloatArray) -> FloatArray:
+        """Return log posteriors (H, M) of the hypotheses summed by class, (classes, M)."""
+        _, first_of_class = np.unique(self.classes, return_index=True)
+        return np.logaddexp.reduceat(log_posterior, first_of_class, axis=0)
+
+
+def worth_of_trial(problem: Problem, proposal: Proposal, alternatives: Alternatives) -> Worth:
+    """Return what a proposed trial is expected to tell about which hypothesis is right."""
     model = (
         problem.model.with_patch(proposal.added_patch)
         if len(proposal.added_patch)
         else problem.model
     )
+    sensors = () if proposal.added_sensor is None else (proposal.added_sensor,)
+    predictions = _predictions(problem, proposal.trial, sensors, alternatives.fits, model)
+    return _simulate_worth(predictions, alternatives)
+
+
+def worths_of_sensors(
+    problem: Problem,
+    trial: Trial,
+    sensors: Sequence[AddedSensor],
+    alternatives: Alternatives,
+) -> list[Worth]:
+    """Return what each of some sensors is expected to tell, if it is added to a trial.
+
+    The trial is predicted once for all sensors.
+    """
+    predictions = _predictions(problem, trial, sensors, alternatives.fits, problem.model)
+    present_count = len(trial.channels)
+    worths = []
+    for number in range(len(sensors)):
+        columns = [*range(present_count), present_count + number]
+        with_sensor = [prediction.of_channels(columns) for prediction in predictions]
+        worths.append(_simulate_worth(with_sensor, alternatives))
+    return worths
+
+
+def _predictions(
+    problem: Problem,
+    trial: Trial,
+    sensors: Sequence[AddedSensor],
+    fits: Sequence[CandidateFit],
+    model: Model,
+) -> "list[_PredictedTrial]":
+    """Return the prediction of a new trial, with additional sensors, by each hypothesis."""
     recorded_over_actual_noise = _recorded_over_actual_noise(problem, most_probable_fit=fits[0])
-    trial = proposal.trial
-    if proposal.doubled_channel:
-        number = problem.channel_names.index(proposal.doubled_channel)
-        problem = problem.with_second_sensor(
-            proposal.doubled_channel, _name_of_second_sensor(proposal.doubled_channel)
-        )
-        trial = _with_second_sensor(trial, proposal.doubled_channel)
-        recorded_over_actual_noise = np.append(
-            recorded_over_actual_noise, recorded_over_actual_noise[number]
-        )
+    numbers_of_noise = [problem.channel_names.index(sensor.noise_of) for sensor in sensors]
+    recorded_over_actual_noise = np.append(
+        recorded_over_actual_noise, recorded_over_actual_noise[numbers_of_noise]
+    )
+    for sensor in sensors:
+        problem = problem.with_channel(sensor.channel, sensor.noise_of)
+    trial = _with_sensors(trial, sensors)
     trial_problem = problem.with_trials((trial,), model)
-    predictions = [_predicted_trial(trial_problem, fit, recorded_over_actual_noise) for fit in fits]
-    gaussians = _reduce_dimensions(predictions, weights)
-    return _simulate_information(gaussians, weights)
+    return [_predicted_trial(trial_problem, fit, recorded_over_actual_noise) for fit in fits]
 
 
 def _recorded_over_actual_noise(problem: Problem, most_probable_fit: CandidateFit) -> FloatArray:
@@ -168,18 +256,24 @@ def _recorded_over_actual_noise(problem: Problem, most_probable_fit: CandidateFi
 
 
 class _PredictedTrial(NamedTuple):
-    """The Gaussian prediction of a trial's N C readings, in units of their noise deviation.
+    """The Gaussian prediction of N readings of C channels, in units of their noise deviation.
 
     Attributes
     ----------
-    mean : (N C,) array
+    mean : (N, C) array
         The mean of the prediction.
-    factor : (K, N C) array
+    factor : (K, N, C) array
         A factor S of the prediction's covariance S^T S by K unknowns, without the noise.
     """
 
     mean: FloatArray
     factor: FloatArray
+
+    def of_channels(self, columns: Sequence[int]) -> "_PredictedTrial":
+        """Return the prediction of some channels alone, without unknowns that move none of them."""
+        factor = self.factor[:, :, columns]
+        is_moving = factor.any(axis=(1, 2))
+        return _PredictedTrial(self.mean[:, columns], factor[is_moving])
 
 
 def _predicted_trial(
@@ -206,28 +300,37 @@ def _predicted_trial(
         0, point, derivatives, fit.candidate
     )
     # derivatives of the readings, by the trial's own unknowns first, in actual noise deviations
-    reading_scale = np.broadcast_to(
-        recorded_over_actual_noise[data.channel_indices], data.weight.shape
-    ).ravel()
-    jacobian = (
-        data.standardise(derivatives_by_unknowns).reshape(
-            len(derivatives_by_unknowns), reading_scale.size
-        )
-        * reading_scale
-    )
+    reading_scale = recorded_over_actual_noise[data.channel_indices]  # (C,)
+    jacobian = data.standardise(derivatives_by_unknowns) * reading_scale
     local_jacobian, shared_jacobian = np.split(jacobian, [local_count])
     prediction = trial_problem.prediction(0, point, derivatives.response)
-    mean = data.standardise(prediction).ravel() * reading_scale
+    mean = data.standardise(prediction) * reading_scale
     # factors S of the covariance S^T S: with C = R R^T the posterior covariance of the shared
     # unknowns and J their derivatives, J^T C J = (R^T J)^T (R^T J); own unknowns are independent
     # with the variance 1 / precision
     covariance = fit.covariance[np.ix_(shared_indices, shared_indices)]
     covariance_root = np.linalg.cholesky(covariance + 1e-12 * np.eye(len(shared_indices)))
     prior_precision = np.maximum(data.unknowns.precision, FREE_PRECISION)
-    local_factor = local_jacobian / np.sqrt(prior_precision)[:, np.newaxis]
-    return _PredictedTrial(
-        mean, np.concatenate((local_factor, covariance_root.T @ shared_jacobian))
-    )
+    local_factor = local_jacobian / np.sqrt(prior_precision)[:, np.newaxis, np.newaxis]
+    shared_factor = np.tensordot(covariance_root.T, shared_jacobian, 1)
+    gain_factor = _factor_of_new_gains(trial_problem, mean)
+    return _PredictedTrial(mean, np.concatenate((local_factor, shared_factor, gain_factor)))
+
+
+def _factor_of_new_gains(trial_problem: Problem, mean: FloatArray) -> FloatArray:
+    """Return the factor (K, N, C) of the gain errors of channels that no fitted trial has.
+
+    `mean` (N, C) is the prediction. The gains of other channels are shared unknowns.
+    """
+    known_gains = (*trial_problem.shared.gain_channels, *trial_problem.shared.fixed_gain)
+    factors = []
+    for column, name in enumerate(trial_problem.trials[0].trial.channels):
+        deviation = trial_problem.campaign.channels[name].gain_deviation
+        if name not in known_gains and 0.0 < deviation < np.inf:
+            factor = np.zeros(mean.shape)
+            factor[:, column] = deviation * mean[:, column]
+            factors.append(factor)
+    return np.array(factors).reshape(-1, *mean.shape)
 
 
 class _Gaussian(NamedTuple):
@@ -260,8 +363,11 @@ def _reduce_dimensions(
     weights : (H,) array
         The probabilities of the hypotheses, of sum one.
     """
-    means = [prediction.mean for prediction in predictions]
-    factors = [prediction.factor for prediction in predictions]
+    means = [prediction.mean.ravel() for prediction in predictions]
+    factors = [
+        prediction.factor.reshape(len(prediction.factor), prediction.mean.size)
+        for prediction in predictions
+    ]
     mean_of_hypotheses = np.average(means, axis=0, weights=weights)
     directions = np.concatenate((np.stack(means) - mean_of_hypotheses, *factors))
     _, singular_values, basis = np.linalg.svd(check_finite(directions), full_matrices=False)
@@ -279,32 +385,38 @@ def _reduce_dimensions(
     return gaussians
 
 
-def _simulate_information(hypotheses: Sequence[_Gaussian], weights: FloatArray) -> float:
-    """Return the mutual information of hypothesis and data [nat], by simulated outcomes.
+def _simulate_worth(predictions: Sequence[_PredictedTrial], alternatives: Alternatives) -> Worth:
+    """Return what a trial is expected to tell, by simulated outcomes.
 
-    It is the entropy of the hypotheses' probabilities, minus the mean entropy of their posterior
-    probabilities over the outcomes.
+    The information is the entropy of the probabilities of the classes, minus the mean entropy of
+    their posterior probabilities over the outcomes. The certainty is the mean of the largest of
+    these.
 
     Parameters
     ----------
-    hypotheses : sequence of _Gaussian
-        The predictions of the H hypotheses.
-    weights : (H,) array
-        Their probabilities, of sum one.
+    predictions : sequence of _PredictedTrial
+        The predictions of the trial by the H hypotheses.
     """
+    weights = alternatives.weights
+    hypotheses = _reduce_dimensions(predictions, weights)
     generator = np.random.default_rng(SEED)
     standard_normal = generator.standard_normal((OUTCOME_SAMPLES, len(hypotheses[0].mean)))
-    entropy = float(-(weights * np.log(weights)).sum())
+    log_prior = alternatives.class_log_sums(np.log(weights)[:, np.newaxis])
+    entropy = -float((np.exp(log_prior) * log_prior).sum())
     entropy_after = 0.0
-    for true_hypothesis, weight in zip(hypotheses, weights, strict=True):
+    certainty = 0.0
+    for true_hypothesis, weight in zip(hypotheses, weights.tolist(), strict=True):
         outcomes = true_hypothesis.mean + standard_normal @ true_hypothesis.root.T
-        # log posterior (H, M) of the hypotheses at the outcomes, by Bayes' theorem
+        # log posterior of the hypotheses, then of the classes, at the outcomes by Bayes' theorem
         log_posterior = np.stack([hypothesis.log_density(outcomes) for hypothesis in hypotheses])
         log_posterior += np.log(weights)[:, np.newaxis]
         log_posterior -= logsumexp(log_posterior, axis=0)
-        entropy_after -= weight * float((np.exp(log_posterior) * log_posterior).sum(axis=0).mean())
+        log_of_classes = alternatives.class_log_sums(log_posterior)
+        of_classes = np.exp(log_of_classes)
+        entropy_after -= weight * float((of_classes * log_of_classes).sum(axis=0).mean())
+        certainty += weight * float(of_classes.max(axis=0).mean())
     # simulated outcomes may give a slightly negative difference
-    return max(entropy - entropy_after, 0.0)
+    return Worth(information=max(entropy - entropy_after, 0.0), certainty=certainty)
 
 
 # ---------------------------------------------------------------- feasible trials
@@ -390,28 +502,99 @@ def second_sensor_proposals(problem: Problem, fits: Sequence[CandidateFit]) -> I
         if name not in doubtful_channels or not trials:
             continue
         trial = max(trials, key=lambda trial: trial.level)
+        second_channel = replace(
+            problem.campaign.channels[name],
+            name=f"second sensor beside {name}",
+            gain_deviation=0.0,
+        )
         yield Proposal(
             trial,
             f"Repeat {trial.name!r} with a second sensor beside {name!r}.",
             "An error of a sensor does not show in another one.",
             COST_OF_SENSOR,
-            doubled_channel=name,
+            added_sensor=AddedSensor(second_channel, noise_of=name),
         )
 
 
-def _name_of_second_sensor(channel_name: str) -> str:
-    """Return the name of the second sensor beside that of a channel."""
-    return f"second sensor beside {channel_name}"
+def added_sensor_worths(
+    problem: Problem, alternatives: Alternatives
+) -> Iterator[tuple[AddedSensor, Proposal, Worth]]:
+    """Yield, of each quantity that the campaign measures, the additional sensor that tells most.
+
+    The sensors are those that the model says a user may add. One is read in the largest loading at
+    each load place, with the noise of a present channel of its quantity.
+    """
+    channels = problem.campaign.channels
+    for quantity in dict.fromkeys(problem.model.possible_sensors.values()):
+        similar = [
+            name
+            for name in channels
+            if channels[name].quantity is quantity and np.isfinite(channels[name].gain_deviation)
+        ]
+        if not similar:
+            continue
+        sensors = []
+        for output, output_quantity in problem.model.possible_sensors.items():
+            if output_quantity is quantity:
+                channel = replace(channels[similar[0]], name=output, output=output)
+                sensors.append(AddedSensor(channel, noise_of=similar[0]))
+        choices = []
+        for trial in _largest_loadings(problem):
+            worths = worths_of_sensors(problem, trial, sensors, alternatives)
+            choices += [(trial, *pair) for pair in zip(sensors, worths, strict=True)]
+        if choices:
+            trial, sensor, worth = max(choices, key=lambda choice: choice[-1].information)
+            proposal = Proposal(
+                trial,
+                f"Repeat {trial.name!r} with {SENSOR_WORDS[quantity]} at {sensor.channel.name}.",
+                "There the open hypotheses differ most.",
+                COST_OF_SENSOR,
+                added_sensor=sensor,
+            )
+            yield sensor, proposal, worth
 
 
-def _with_second_sensor(trial: Trial, channel_name: str) -> Trial:
-    """Return a trial with a second sensor, which has the same readings as the channel."""
-    column = trial.channels.index(channel_name)
+def added_load_worths(
+    problem: Problem, alternatives: Alternatives
+) -> Iterator[tuple[Proposal, Worth]]:
+    """Yield the loading at another place that tells most, with the sensors of the campaign.
+
+    Nothing is yielded without a loading in the campaign,
+    or if the model cannot be loaded at another place.
+    """
+    loadings = _largest_loadings(problem)
+    choices = []
+    for place in problem.model.possible_loads[:MOST_LOADS] if loadings else ():
+        trial = replace(loadings[0], name=f"load at {place}", load_place=place)
+        description = f"Load at {place} instead, to {trial.level:.3g} N."
+        reason = "What looks alike under one load differs under another."
+        proposal = Proposal(trial, description, reason, COST_OF_LOAD)
+        with suppress(DiscrepancyError):  # the model cannot simulate this trial
+            choices.append((proposal, worth_of_trial(problem, proposal, alternatives)))
+    if choices:
+        yield max(choices, key=lambda choice: choice[1].information)
+
+
+def _largest_loadings(problem: Problem) -> list[Trial]:
+    """Return the static trial with the largest force at each load place."""
+    loadings: dict[object, Trial] = {}
+    for trial in problem.campaign.trials:
+        if trial.kind is TrialKind.STATIC:
+            previous = loadings.get(trial.load_place, trial)
+            loadings[trial.load_place] = max(previous, trial, key=lambda trial: trial.level)
+    return list(loadings.values())
+
+
+def _with_sensors(trial: Trial, sensors: Sequence[AddedSensor]) -> Trial:
+    """Return a trial with more sensors, whose readings are used where those of any channel are."""
+    sensor_count = len(sensors)
+    sample_count = len(trial.values)
+    is_used = trial.used.any(axis=1, keepdims=True)
     return replace(
         trial,
-        channels=(*trial.channels, _name_of_second_sensor(channel_name)),
-        values=np.column_stack((trial.values, trial.values[:, column])),
-        used=np.column_stack((trial.used, trial.used[:, column])),
+        channels=(*trial.channels, *(sensor.channel.name for sensor in sensors)),
+        values=np.hstack((trial.values, np.zeros((sample_count, sensor_count)))),
+        used=np.hstack((trial.used, np.tile(is_used, sensor_count))),
     )
 
 

@@ -7,9 +7,10 @@ can be told apart. A *confusion group* is a set of effects that cannot. Squared 
 units of the noise variance, sigma^2.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from itertools import combinations
 from math import inf, isfinite, sqrt
 from typing import NamedTuple
 
@@ -83,6 +84,30 @@ class Detectability:
 
 
 @dataclass(frozen=True)
+class Confusion:
+    """Two effects that a campaign cannot tell apart.
+
+    Attributes
+    ----------
+    true_term : EffectTerm
+        The effect that acts, at the place at which it changes the readings most.
+    true_values : (E,) array
+        Its scaled parameters.
+    other_effect : Effect
+        The effect that can change the readings nearly as it does.
+    """
+
+    true_term: EffectTerm
+    true_values: FloatArray
+    other_effect: Effect
+
+    @property
+    def effects(self) -> frozenset[str]:
+        """The identifiers of both effects."""
+        return frozenset((self.true_term.effect.identifier, self.other_effect.identifier))
+
+
+@dataclass(frozen=True)
 class Separability:
     """Which effects a campaign can detect, and which it can tell apart.
 
@@ -98,12 +123,16 @@ class Separability:
         detectable size if that is larger.
     groups : tuple of tuple of str
         The confusion groups of two or more effects.
+    confusions : tuple of Confusion
+        Each pair of effects that are closer than `CONFUSION_DISTANCE`, in the direction in which
+        they are closer.
     """
 
     detectability: tuple[Detectability, ...]
     identifiers: tuple[str, ...]
     distance: FloatArray
     groups: tuple[tuple[str, ...], ...]
+    confusions: tuple[Confusion, ...]
 
 
 # ---------------------------------------------------------------- a campaign as predicted
@@ -221,8 +250,13 @@ def compute_separability(
             )
     identifiers = tuple(effect.identifier for effect in visible_effects)
     distance_matrix = _distances(screen, visible_effects)
-    groups = _confusion_groups(identifiers, distance_matrix)
-    return Separability(tuple(detectability), identifiers, distance_matrix, groups)
+    return Separability(
+        detectability=tuple(detectability),
+        identifiers=identifiers,
+        distance=distance_matrix,
+        groups=_confusion_groups(identifiers, distance_matrix),
+        confusions=tuple(_confusions(visible_effects, distance_matrix)),
+    )
 
 
 class _VisibleEffect(NamedTuple):
@@ -394,6 +428,22 @@ def _distances(screen: Screen, effects: Sequence[_VisibleEffect]) -> FloatArray:
     distance *= np.maximum(1.0, DETECTION_DISTANCE / squared_lengths)[:, None]
     np.fill_diagonal(distance, 0.0)
     return distance
+
+
+def _confusions(effects: Sequence[_VisibleEffect], distance: FloatArray) -> Iterator[Confusion]:
+    """Yield the pairs of effects that are confused, given their distances (E, E) [sigma^2]."""
+    for pair in combinations(range(len(effects)), 2):
+        row, column = min((pair, pair[::-1]), key=lambda indices: distance[indices])
+        if distance[row, column] >= CONFUSION_DISTANCE:
+            continue
+        reference = effects[row].reference
+        # an effect that is not detected at its reference is compared at the least size that is
+        factor = max(1.0, sqrt(DETECTION_DISTANCE / reference.squared_length))
+        yield Confusion(
+            true_term=reference.term,
+            true_values=reference.term.multiply_magnitudes(reference.effect_values, factor),
+            other_effect=effects[column].options[0].term.effect,
+        )
 
 
 def _small_changes(screen: Screen, effect: _VisibleEffect) -> list[_SmallChange]:

@@ -8,6 +8,7 @@ import numpy as np
 
 from discrepancy.campaign.records import Campaign, FloatArray, Quantity
 from discrepancy.campaign.units import UNITS
+from discrepancy.catalogue.effect_in_setting import MOTION_WORDS
 from discrepancy.files.verdict import PrimitiveInterval
 from discrepancy.report.text import NAMING, unit_text
 from discrepancy.system.interface import Model
@@ -16,6 +17,7 @@ from discrepancy.verdict import NamedEffect, VerdictKind
 from discrepancy.workflow import Investigation
 from fe.runtime.patch import (
     CHANNEL_UNIT,
+    InterfaceCompliance,
     ModelPatch,
     PlaceMass,
     Primitive,
@@ -69,7 +71,7 @@ def si_sizes(
             continue
         half_width = 0.0
         interval = ""
-        if isinstance(primitive, SupportCompliance):
+        if isinstance(primitive, SupportCompliance | InterfaceCompliance):
             size = _as_spring(size, primitive)
             unit = size.unit
         if isfinite(size.low) and isfinite(size.high) and size.low < size.high:
@@ -79,6 +81,9 @@ def si_sizes(
         if isinstance(primitive, SupportCompliance):
             motion = _motion_text(primitive.motion)
             name = f"the support {primitive.support} {motion} against a spring of"
+        elif isinstance(primitive, InterfaceCompliance):
+            motion = _motion_text(primitive.motion)
+            name = f"the interface {primitive.interface} {motion} against a spring of"
         if isinstance(primitive, PlaceMass):
             place_text = _point_text(size.primitive, primitive, intervals, model)
         else:
@@ -87,8 +92,10 @@ def si_sizes(
     return ", ".join(sizes)
 
 
-def _as_spring(size: PrimitiveInterval, primitive: SupportCompliance) -> PrimitiveInterval:
-    """Return the interval of the spring of a support that yields: the inverse of its compliance."""
+def _as_spring(
+    size: PrimitiveInterval, primitive: SupportCompliance | InterfaceCompliance
+) -> PrimitiveInterval:
+    """Return the interval of the spring of what yields: the inverse of its compliance."""
     turns = primitive.motion.startswith("r")
     return replace(
         size,
@@ -100,9 +107,9 @@ def _as_spring(size: PrimitiveInterval, primitive: SupportCompliance) -> Primiti
 
 
 def _motion_text(motion: str) -> str:
-    """Return a motion of a support as a predicate: "turns about z"."""
-    axis = motion[-1]
-    return f"turns about {axis}" if motion.startswith("r") else f"shifts along {axis}"
+    """Return a motion of a support or interface as a predicate: "turns about z"."""
+    verb, *words = MOTION_WORDS[motion].split()
+    return " ".join((f"{verb}s", *words))
 
 
 def size_sentence(
@@ -231,7 +238,7 @@ def definite_unit(unit: str, primitive: Primitive, model: Model, campaign: Campa
     if " or " not in unit:
         return unit_text(unit)
     unit_if_moving, unit_if_turning = unit.split(" or ")
-    if isinstance(primitive, SupportCompliance):
+    if isinstance(primitive, SupportCompliance | InterfaceCompliance):
         is_turn = primitive.motion.startswith("r")  # such as "rx"; "x" is a displacement
         return unit_if_turning if is_turn else unit_if_moving
     port = str(getattr(primitive, "port", ""))

@@ -87,7 +87,8 @@ class Model(ABC):
     stations : tuple of float, optional
         Least and largest station [m] along the structure, if it has a length.
     nuisance_parameters : frozenset of str
-        Parameters that no file states and no result lists, such as errors of the mesh.
+        Parameters that no file states and no result lists, such as errors of the mesh. They have
+        no influence on trials at rest.
     patch : ModelPatch
         The primitives that act in every response: a known addition, or an effect that was found.
     regions : tuple of str
@@ -98,6 +99,8 @@ class Model(ABC):
         The kinds of trials that it can simulate.
     support_motions : tuple of (str, str)
         The supports that may yield, each with a motion, such as "rx".
+    interface_motions : tuple of (str, str)
+        The interfaces of two parts that may yield, each with a motion, such as "rs".
     mass_places : tuple of str
         Places where a mass may be added or lost.
     mass_reaches : mapping of str to float
@@ -114,6 +117,10 @@ class Model(ABC):
         Changes of forces: the control, "offset" of its place or "tilt", and the axis.
     gauge_shifts : tuple of (str, str)
         Gauges whose place may be wrong, with "along" or "across".
+    possible_sensors : mapping of str to Quantity
+        Outputs that the structure file does not declare, of sensors that a user may add.
+    possible_loads : tuple of str
+        Load places that it does not declare, of forces that a user may apply.
     load_places : tuple of str, optional
         The names of the places where forces can act; None: anywhere along the structure.
     largest_force : float
@@ -140,6 +147,7 @@ class Model(ABC):
     largest_losses: Mapping[str, float] = MappingProxyType({})
     kinds: frozenset[TrialKind] = frozenset(TrialKind)
     support_motions: tuple[tuple[str, str], ...] = ()
+    interface_motions: tuple[tuple[str, str], ...] = ()
     mass_places: tuple[str, ...] = ()
     mass_reaches: Mapping[str, float] = MappingProxyType({})
     shows_weight: bool = False
@@ -147,6 +155,8 @@ class Model(ABC):
     places_with_gauges: frozenset[str] = frozenset()
     load_changes: tuple[tuple[str, str, str], ...] = ()
     gauge_shifts: tuple[tuple[str, str], ...] = ()
+    possible_sensors: Mapping[str, Quantity] = MappingProxyType({})
+    possible_loads: tuple[str, ...] = ()
     load_places: tuple[str, ...] | None = None
     largest_force: float = np.inf
     holds_inputs: ClassVar[bool] = False

@@ -101,7 +101,7 @@ class Scales:
         By port name: those of `Model.ports`, and the places of forces that are distributed over the
         structure.
     support_compliances : mapping of (str, str) to float
-        For each support of a structure that may yield, and each of its motions, the compliance that
+        For each support or interface that may yield, and each of its motions, the compliance that
         doubles the compliance of the structure under the load, or in the mode, where it matters
         most [m/N or rad/(N m)].
     """

@@ -36,6 +36,7 @@ from fe.runtime.patch import (
 from fe.runtime.reduced import ReducedModel
 from fe.runtime.state import Losses
 from fe.structure.affine import PORT_PREFIX
+from fe.structure.tables import INTERFACE_MOTIONS, MOTIONS
 
 LOAD_FACTOR = "load_factor"
 """Control that is the load factor of flights."""
@@ -43,6 +44,8 @@ DEVIATION = 0.25
 """Standard deviation of a parameter that was not calibrated, as a fraction of its range."""
 ROUNDING = 1e-9
 """Differences of two rows below this fraction of the largest entry are rounding errors."""
+AXES = ("x", "y", "z")
+"""Axes along which a place of the structure may be measured or loaded."""
 LARGEST_LOSS = 0.7
 """Largest loss of stiffness of a patch that is compared."""
 
@@ -94,6 +97,9 @@ class StructureModel(SystemModel):
     def __init__(self, model: ReducedModel) -> None:
         self.model = model
         self.name = model.name
+        # displacements, or forces of 1 N, at places of the structure, by the name of each
+        self._place_rows: dict[str, FloatArray] = {}
+        self._loaded_place: dict[str, str] = {}
         self.regions = model.regions
         self.largest_losses = {region: model.validity[region][1] for region in model.regions}
         self.parameters = _parameter_priors(model)
@@ -127,6 +133,10 @@ class StructureModel(SystemModel):
         self._rows = dict(zip(names, rows, strict=True))
         if isinstance(model, ChangeableModel):
             self._rows |= _strains_near_gauges(model)
+            self._rows |= self._place_rows
+            for ending, strains in zip(("", *ACROSS), model.possible_gauge_output, strict=True):
+                for gauge, row in zip(model.possible_gauges, strains, strict=True):
+                    self._rows[gauge + ending] = row
         displacements = [name for name in model.displacements if not _is_at_port(name)]
         self.quantities = {
             **dict.fromkeys(model.gauges, Quantity.STRAIN),
@@ -142,7 +152,9 @@ class StructureModel(SystemModel):
 
     def _name_changes(self, model: ChangeableModel) -> None:
         """Set the attributes that say which changes the structure may have, from its model."""
-        self.support_motions = tuple(zip(model.supports, model.motions, strict=True))
+        motions = list(zip(model.supports, model.motions, strict=True))
+        self.support_motions = tuple(pair for pair in motions if pair[1] in MOTIONS)
+        self.interface_motions = tuple(pair for pair in motions if pair[1] in INTERFACE_MOTIONS)
         self.mass_places = model.mass_places
         reaches = zip(model.mass_places, model.mass_reaches.tolist(), strict=True)
         self.shows_weight = bool(model.load_accelerations.any())
@@ -164,6 +176,13 @@ class StructureModel(SystemModel):
             )
         )
         self.gauge_shifts = tuple(zip(model.shifted_gauges, model.shift_axes, strict=True))
+        for place, rows in zip(model.mass_places, model.mass_rows, strict=True):
+            for axis, row in zip(AXES, rows, strict=True):
+                self._place_rows[f"{place} along {axis}"] = row
+                self._loaded_place[f"{place} along {axis}"] = place
+        self.possible_loads = tuple(self._place_rows)
+        self.possible_sensors = dict.fromkeys(self._place_rows, Quantity.DISPLACEMENT)
+        self.possible_sensors |= dict.fromkeys(model.possible_gauges, Quantity.STRAIN)
 
     def _ports_of_loads(self, displacements: Iterable[str]) -> dict[str, FloatArray]:
         """Return the rows (n,) of the displacement outputs along which a force acts, by name.
@@ -298,6 +317,7 @@ class StructureModel(SystemModel):
         `LoadGain`                  a force
         `LoadOffset`, `LoadTilt`    a force that may be moved or turned
         `SupportCompliance`         a support that may yield
+        `InterfaceCompliance`       an interface
         `GaugeOffset`               a gauge that may lie beside its place
         sensors                     nothing, as they act on readings
         ==========================  ==========================================
@@ -314,6 +334,8 @@ class StructureModel(SystemModel):
             return bool(self.load_changes)
         if primitive is changes.SupportCompliance:
             return bool(self.support_motions)
+        if primitive is changes.InterfaceCompliance:
+            return bool(self.interface_motions)
         if primitive is changes.GaugeOffset:
             return bool(self.gauge_shifts)
         return primitive in SENSORS
@@ -340,13 +362,16 @@ class StructureModel(SystemModel):
     ) -> FloatArray:
         """Return the load (k,) of a force of 1 N, or of the load factor 1 if there are no forces.
 
-        Primitives in `change` may move and turn the force.
+        The place is a force of the file, or one of `possible_loads`. The primitives of `change` may
+        alter the place and the direction of a force of the file.
 
         Raises
         ------
         ModelError
             If there is no such force, or none is named of several.
         """
+        if place in self._place_rows:
+            return self._in_state(self._place_rows[str(place)], state)
         places = self.forces or (LOAD_FACTOR,)
         control = choose_load_place(places, place, self.quoted_name)
         load = self._unit_load(state, control)
@@ -355,9 +380,14 @@ class StructureModel(SystemModel):
         return self._in_state(load, state)
 
     def output_quantity(self, output: str) -> Quantity | None:
-        """Return the quantity of an output; strains across gauges and shear are not listed."""
-        is_across = output.endswith(ACROSS) and output in self._rows
-        return Quantity.STRAIN if is_across else super().output_quantity(output)
+        """Return the quantity of an output.
+
+        Strains across gauges, shear strains and sensors that may be added are not listed in
+        `quantities`.
+        """
+        if output.endswith(ACROSS) and output in self._rows:
+            return Quantity.STRAIN
+        return self.possible_sensors.get(output) or super().output_quantity(output)
 
     def lift_loads(self, state: SystemState, change: ModelPatch) -> FloatArray:
         """Return the load (1, k) of the load factor."""
@@ -396,8 +426,13 @@ class StructureModel(SystemModel):
     ) -> PatchedTrial:
         """Return a trial with its patch and conditions, with losses of patches in its structure."""
         case = super().patched_trial(trial, conditions, patch)
-        losses = ModelPatch(tuple(filter(self._is_loss_of_patch, patch)))
-        return case._replace(state=case.state._replace(structure=case.state.structure + losses))
+        structure = case.state.structure
+        structure += ModelPatch(tuple(filter(self._is_loss_of_patch, patch)))
+        place = self._loaded_place.get(str(trial.load_place))
+        if place is not None:
+            # no mass, but the columns of one: the responses to forces at the place
+            structure += ModelPatch((changes.PlaceMass(place, 0.0),))
+        return case._replace(state=case.state._replace(structure=structure))
 
     def build_system(self, state: SystemState) -> LinearSystem:
         """Return the linear system in a state, in the coordinates in which it is solved.
@@ -432,11 +467,11 @@ class StructureModel(SystemModel):
         return state.parameters[: len(self.model.parameters) + len(self.model.masses)]
 
     def scales(self, campaign: Campaign) -> Scales:
-        """Return the natural scales under a campaign, with those of supports that may yield.
+        """Return the natural scales under a campaign, with those of supports and interfaces.
 
-        The natural compliance of a support motion is the one that changes a static compliance or an
-        inverse squared frequency of the structure by 100 % (to first order). It is 1 if the support
-        does not carry the structure.
+        The natural compliance of a motion that they hold is the one that changes a static
+        compliance or an inverse squared frequency of the structure by 100 % (to first order). It is
+        1 if the motion does not carry the structure.
         """
         scales = super().scales(campaign)
         if not isinstance(self.model, ChangeableModel):
@@ -449,7 +484,11 @@ class StructureModel(SystemModel):
         largest_gains = gains.max(axis=1, initial=0.0).tolist()
         compliances = {
             motion: 1.0 / gain if gain > 0.0 else 1.0
-            for motion, gain in zip(self.support_motions, largest_gains, strict=True)
+            for motion, gain in zip(
+                zip(self.model.supports, self.model.motions, strict=True),
+                largest_gains,
+                strict=True,
+            )
         }
         return replace(scales, support_compliances=compliances)
 

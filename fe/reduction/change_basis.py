@@ -1,10 +1,10 @@
 """Extend the reduced model of a structure by columns for changes of supports, mass and stiffness.
 
-A support that yields moves the structure by the unit responses to its motions: the displacements of
-the structure when one motion of a support is prescribed and all else is held. They are added to the
-basis of the reduced model (the constraint modes of Craig and Bampton 1968, AIAA Journal 6 (7),
-1313-1319), with the static responses to their inertia. They depend on the stiffness of the
-structure, so they are computed in several states.
+A support or an interface that yields moves the structure by the unit responses to its motions: the
+displacements of the structure when one such motion is prescribed and all else is held. They are
+added to the basis of the reduced model (the constraint modes of Craig and Bampton 1968, AIAA
+Journal 6 (7), 1313-1319), with the static responses to their inertia. They depend on the stiffness
+of the structure, so they are computed in several states.
 
 For a point mass, the static responses to forces at its location are added. For a loss of stiffness
 of a patch, the changes of the solutions under loads, of those under outputs as loads, and of the
@@ -21,7 +21,13 @@ from scipy.linalg import eigh
 from fe.full.subspace import OrthonormalBasis, affine_product, solve_near
 from fe.runtime.arrays import FloatArray
 from fe.runtime.changeable import ChangeableModel, ChangedStructure
-from fe.runtime.patch import ModelPatch, PlaceMass, RegionStiffnessLoss, SupportCompliance
+from fe.runtime.patch import (
+    InterfaceCompliance,
+    ModelPatch,
+    PlaceMass,
+    RegionStiffnessLoss,
+    SupportCompliance,
+)
 from fe.structure.affine import AffineStructure, SupportMotion
 from fe.structure.candidates import (
     LossCandidate,
@@ -30,6 +36,7 @@ from fe.structure.candidates import (
     loss_places,
     mass_places,
 )
+from fe.structure.tables import INTERFACE_MOTIONS
 
 from .change_model import PossibleChanges, WholeColumns, model_on_columns
 from .changed_case import ChangedCase, case_error
@@ -375,7 +382,11 @@ class _Columns:
         reference = self.held_terms.reference
         vector = self._middle_vector(model)
         compliance = gain / float(model.compliance_gains(vector)[number].max())
-        primitive = SupportCompliance(motion.support, motion.motion, compliance)
+        primitive = (
+            InterfaceCompliance(motion.support, motion.motion, compliance)
+            if motion.motion in INTERFACE_MOTIONS
+            else SupportCompliance(motion.support, motion.motion, compliance)
+        )
         structure = ChangedStructure(model, vector, ModelPatch((primitive,)))
         # the full model by Sherman and Morrison: the held structure, and its unit response
         direction = np.zeros((self.structure.unknowns, 1))

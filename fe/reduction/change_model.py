@@ -16,6 +16,7 @@ from fe.structure.candidates import (
     LossCandidate,
     MassCandidate,
     gauge_shifts,
+    possible_gauges,
     strains_across,
 )
 from fe.structure.operators import Structure
@@ -76,6 +77,7 @@ def model_on_columns(
     factors = terms.load_factors.tolist()
     loads = [terms.loads[:, factors.index(row)] for row in load_factors.tolist()]
     outputs = np.concatenate((terms.outputs.T, structure.acceleration_output.toarray()), axis=0)
+    added_gauges, strain_rows = possible_gauges(structure)
     change_count = len(structure.support_motions) + len(changes.masses) + len(changes.losses)
     return ChangeableModel(
         **{field.name: getattr(model, field.name) for field in fields(ReducedModel)},
@@ -87,6 +89,8 @@ def model_on_columns(
         column_owner=whole.owners,
         size=structure.mesh.size if isinstance(structure, Structure) else 1.0,
         across_output=np.array([rows @ columns for rows in strains_across(structure)]),
+        possible_gauges=added_gauges,
+        possible_gauge_output=np.array([rows @ columns for rows in strain_rows]),
         patch_of_gauge=_patch_of_gauges(structure, changes.losses),
         change_errors=np.zeros(change_count),
         **_support_arrays(structure, columns),

@@ -18,6 +18,7 @@ from .arrays import FloatArray, IntArray
 from .dense_matrices import dense_sum, lowest_modes
 from .errors import InvalidPatchError
 from .patch import (
+    InterfaceCompliance,
     LoadOffset,
     LoadTilt,
     ModelPatch,
@@ -70,7 +71,7 @@ class StructuralChanges(NamedTuple):
     Attributes
     ----------
     compliances : dict of int to float
-        Added compliance of motions of supports [m/N or rad/(N m)].
+        Added compliance of motions of supports and interfaces [m/N or rad/(N m)].
     masses : tuple of AddedMass
         Added masses.
     losses : dict of int to float
@@ -117,7 +118,7 @@ class ChangeableModel(ReducedModel):
     """A reduced model with the columns that changes of `fe.runtime.patch` need.
 
     There are n coordinates: Nm of the modal basis, N of the static basis, and the columns of the
-    changes. S motions of supports may change.
+    changes. S motions of supports and of interfaces may change.
 
     Attributes
     ----------
@@ -134,9 +135,10 @@ class ChangeableModel(ReducedModel):
         The outputs.
     column_owner : (n,) array of int64
         Number of the change that a column belongs to, counted from one; zero for the structure
-        itself. The first S changes are motions of supports.
+        itself. The first S changes are motions of supports and interfaces.
     supports, motions : tuple of str
-        Support and motion ("x" to "rz") of each of the S motions.
+        Support and motion ("x" to "rz"), or interface and motion ("n" to "rt"), of each of the S
+        motions.
     support_rows : (S, n) array
         Rows that give each motion [m or rad]. That of a motion that is held has a one at a column
         of its own, and zeros.
@@ -163,6 +165,10 @@ class ChangeableModel(ReducedModel):
         Patch, and stiffness term, of each part of the stiffness that patches hold.
     loss_stiffness : (Q, n (n + 1) / 2) array
         Lower triangle, row by row, of each part.
+    possible_gauges : tuple of str
+        Points and directions of H gauges that may be added.
+    possible_gauge_output : (3, H, n) array
+        Their strains, the strains across them, and the shear strains.
     patch_of_gauge : (G,) array of int64
         Patch on which each gauge sits, -1 for none.
     size : float
@@ -207,6 +213,8 @@ class ChangeableModel(ReducedModel):
     loss_patch: Annotated[IntArray, "parts"]
     loss_term: Annotated[IntArray, "parts"]
     loss_stiffness: Annotated[FloatArray, "parts", "triangle"]
+    possible_gauges: tuple[str, ...]
+    possible_gauge_output: Annotated[FloatArray, 3, "gauges that may be added", "whole"]
     patch_of_gauge: Annotated[IntArray, "gauges"]
     size: Annotated[float, float_info.min, inf]
     load_controls: tuple[str, ...]
@@ -225,6 +233,7 @@ class ChangeableModel(ReducedModel):
         places = len(self.supports) + len(self.mass_places) + len(self.loss_places)
         return super()._axis_lengths() | {
             "masses added": len(self.mass_places),
+            "gauges that may be added": len(self.possible_gauges),
             "changed loads": len(self.load_controls),
             "gauge shifts": len(self.shifted_gauges),
             "triangle": size * (size + 1) // 2,
@@ -247,13 +256,17 @@ class ChangeableModel(ReducedModel):
         masses: list[AddedMass] = []
         remaining_fractions: dict[int, float] = {}
         for primitive in patch:
-            if isinstance(primitive, SupportCompliance):
+            if isinstance(primitive, SupportCompliance | InterfaceCompliance):
+                if isinstance(primitive, SupportCompliance):
+                    kind, name = "support", primitive.support
+                else:
+                    kind, name = "interface", primitive.interface
                 if primitive.compliance < 0.0:
                     raise InvalidPatchError(
-                        f"The compliance of the support {primitive.support!r} must not be "
-                        f"negative, but is {primitive.compliance:g}."
+                        f"The compliance of the {kind} {name!r} must not be negative, but is "
+                        f"{primitive.compliance:g}."
                     )
-                number = 1 + self.support_number(primitive.support, primitive.motion)
+                number = 1 + self.support_number(name, primitive.motion)
                 compliances[number] = compliances.get(number, 0.0) + primitive.compliance
             elif isinstance(primitive, PlaceMass):
                 first_number = 1 + len(self.supports)
@@ -404,7 +417,10 @@ class ChangeableModel(ReducedModel):
         return self.loss_term[parts_in_patch], np.array(parts)
 
     def support_number(self, support: str, motion: str) -> int:
-        """Return the index of a support's motion; raise `InvalidPatchError` if there is none."""
+        """Return the index of a motion of a support or interface.
+
+        Raises `InvalidPatchError` if there is none.
+        """
         pairs = list(zip(self.supports, self.motions, strict=True))
         if (support, motion) not in pairs:
             names = ", ".join(f"{name} {of_name}" for name, of_name in pairs) or "none"

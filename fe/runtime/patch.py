@@ -98,6 +98,22 @@ class SupportCompliance(Primitive):
     """Motion of the support for each unit of its reaction."""
 
 
+class InterfaceCompliance(Primitive):
+    """An interface of two parts yields: a motion that it holds is against a spring.
+
+    The spring has the inverse of this `compliance`. The motion is "n", "s" or "t", along the normal
+    and the longer and the shorter extent of the interface, or "rn", "rs" or "rt", about these axes
+    through its centre. If a spring resists it already, the new one is in series with it.
+    """
+
+    interface: str
+    """Name of the interface."""
+    motion: str
+    """Motion of the second part against the first one: "n", "s", "t", or "rn", "rs", "rt"."""
+    compliance: Annotated[float, "m/N or rad/(N m)"]
+    """Added compliance."""
+
+
 class LocalStiffnessLoss(Primitive):
     """The skin loses `loss` of its stiffness over `length` beyond `start` [m from the root]."""
 
@@ -254,6 +270,7 @@ STRUCTURE = (
     PointMass,
     PlaceMass,
     SupportCompliance,
+    InterfaceCompliance,
     LocalStiffnessLoss,
     ModulusTemperature,
 )

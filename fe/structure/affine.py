@@ -55,14 +55,14 @@ class LoadTerm(NamedTuple):
 
 
 class SupportMotion(NamedTuple):
-    """A motion of a support that is an unknown of the structure.
+    """A motion of a support or an interface that is an unknown of the structure.
 
     Attributes
     ----------
     support : str
-        The support's set of nodes, or its nodes.
+        The support's set of nodes, its nodes, or the name of the interface.
     motion : str
-        One of `tables.MOTIONS`.
+        One of `tables.MOTIONS`, or of `tables.INTERFACE_MOTIONS`.
     unknown : int
         Index of the unknown [m or rad].
     spring : float

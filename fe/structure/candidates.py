@@ -18,7 +18,7 @@ from fe.runtime.errors import InvalidDesignError
 
 from .affine import AffineStructure
 from .design import Gauge, MeshLoad
-from .gauges import cells_at_gauges, gauge_rows, strain_factors
+from .gauges import cells_at_gauges, evenly_placed_rosettes, gauge_rows, strain_factors
 from .matrices import MatrixStructure
 from .matrix_design import MatrixLoad, MatrixMass, NodeOutput
 from .mesh import StructureMesh
@@ -29,6 +29,10 @@ GRID_POINTS = 36
 """Largest number of points of the grid at which a mass may be."""
 GRID_PATCHES = 12
 """Largest number of patches of the grid that may lose stiffness."""
+GAUGE_POINTS = 12
+"""Largest number of points of the surface at which a gauge may be added."""
+ROUNDING_OF_POINTS = 1e-3
+"""Rounding of the points in the names of these gauges, relative to the size of the mesh."""
 LEAST_DISTANCE = 0.1
 """Least distance between the centres of two patches, relative to the size of the mesh."""
 LEAST_DISTANCE_OF_POINTS = 0.07
@@ -424,22 +428,57 @@ def _derivatives_of_weights(
 
 
 def strains_across(structure: AffineStructure) -> list[sparse.csr_array]:
-    """Return the matrices (G, n) of the transverse strains and of the shear strains at G gauges.
+    """Return the matrices (G, n) of the transverse strains and of the shear strains at G gauges."""
+    if not isinstance(structure, Structure):
+        no_rows = sparse.csr_array((0, structure.unknowns))
+        return [no_rows, no_rows]
+    factors = strain_factors(structure.mesh, structure.design)
+    _, *across = _strains_at_gauges(structure, structure.design.gauge, factors)
+    return across
+
+
+def _strains_at_gauges(
+    structure: Structure, gauges: tuple[Gauge, ...], factors: FloatArray | None = None
+) -> list[sparse.csr_array]:
+    """Return the matrices (G, n) of the strains along G gauges, of those across, and of the shear.
 
     The shear strain is 2 e45 - e - e_across, where e is the strain along the gauge, e_across the
     strain at 90 degrees to it, and e45 that at 45 degrees.
     """
-    if not isinstance(structure, Structure):
-        no_rows = sparse.csr_array((0, structure.unknowns))
-        return [no_rows, no_rows]
-    along = structure.gauge_output
-    factors = strain_factors(structure.mesh, structure.design)
     rows = []
-    for turn in (0.5 * np.pi, 0.25 * np.pi):
-        turned_rows, _ = gauge_rows(structure.mesh, structure.design.gauge, turn, factors=factors)
-        rows.append((turned_rows @ structure.expansion).tocsr())
-    across, halfway = rows
-    return [across, (2.0 * halfway - along - across).tocsr()]
+    for turn in (0.0, 0.5 * np.pi, 0.25 * np.pi):
+        turned, _ = gauge_rows(structure.mesh, gauges, turn, factors=factors)
+        rows.append((turned @ structure.expansion).tocsr())
+    along, across, halfway = rows
+    return [along, across, (2.0 * halfway - along - across).tocsr()]
+
+
+def possible_gauges(structure: AffineStructure) -> tuple[tuple[str, ...], list[sparse.csr_array]]:
+    """Return the names of gauges that a user may add to a mesh, and rows that give their strains.
+
+    They lie at points that are spread evenly over the surface, two at right angles at each.
+
+    Returns
+    -------
+    names : tuple of str
+        The point and the direction of each of H gauges.
+    rows : list of csr (H, n)
+        The strains along the gauges at these points, those across, and the shear strains.
+    """
+    if not isinstance(structure, Structure):
+        return (), [sparse.csr_array((0, structure.unknowns))] * 3
+    mesh = structure.mesh
+    gauges: list[Gauge] = []
+    for rosette in evenly_placed_rosettes(mesh, GAUGE_POINTS):
+        crossed = rosette.model_copy(update={"angles": (0.0, 90.0)})
+        gauges.extend(crossed.gauges())
+    decimals = int(np.ceil(-np.log10(ROUNDING_OF_POINTS * mesh.size)))
+    names = []
+    for gauge in gauges:
+        point = mesh.describe_point(np.round(mesh.unit * np.array(gauge.point), decimals))
+        direction = ", ".join(f"{value + 0.0:.3g}" for value in np.round(gauge.direction, 3))
+        names.append(f"{point} along ({direction})")
+    return tuple(names), _strains_at_gauges(structure, tuple(gauges))
 
 
 class GaugeShift(NamedTuple):

@@ -11,6 +11,7 @@ from fe.runtime.arrays import FloatArray
 from fe.runtime.errors import InvalidDesignError, InvalidPatchError
 from fe.runtime.patch import (
     GaugeOffset,
+    InterfaceCompliance,
     LoadOffset,
     LoadTilt,
     ModelPatch,
@@ -22,16 +23,17 @@ from fe.runtime.patch import (
 from reporting.formats.toml_file import read_toml
 
 from .candidates import AXES, patches_of_mesh, places_of_mesh
-from .design import Gauge, MeshDesign, load_structure, parse_structure
+from .design import Gauge, Interface, MeshDesign, load_structure, parse_structure
 from .gauges import gauge_axes
 from .location import nearest_point
 from .mesh import StructureMesh
 from .nodal_loads import point_weights, set_weights
 from .operators import part_of_cells, structure_mesh
-from .tables import MOTIONS
+from .tables import INTERFACE_MOTIONS, MOTIONS
 
 WRITTEN = (
     SupportCompliance,
+    InterfaceCompliance,
     PlaceMass,
     RegionStiffnessLoss,
     LoadOffset,
@@ -39,6 +41,14 @@ WRITTEN = (
     GaugeOffset,
 )
 """Kinds of primitives that the structure file of a mesh can express."""
+
+SPRING_KEYS = {
+    "normal": ("n",),
+    "tangential": ("s", "t"),
+    "twist": ("rn",),
+    "bending": ("rs", "rt"),
+}
+"""Motions of an interface whose springs each key of its table gives."""
 
 Tables = dict[str, Any]
 
@@ -73,6 +83,8 @@ def changed_tables(file: Path, patch: ModelPatch, folder: Path) -> Tables:
     for primitive in patch:
         if isinstance(primitive, SupportCompliance):
             _soften_support(tables, mesh, primitive)
+        elif isinstance(primitive, InterfaceCompliance):
+            _soften_interface(tables, design, primitive)
         elif isinstance(primitive, PlaceMass):
             _add_mass(tables, mesh, primitive)
         elif isinstance(primitive, RegionStiffnessLoss):
@@ -129,6 +141,24 @@ def _soften_support(tables: Tables, mesh: StructureMesh, primitive: SupportCompl
     springs[number] = 1.0 / compliance
     row["springs"] = springs
     row["hold"] = [motion for motion in row.get("hold", ()) if motion != primitive.motion]
+
+
+def _soften_interface(tables: Tables, design: MeshDesign, primitive: InterfaceCompliance) -> None:
+    """Give one motion of an interface a spring, in series with the one that it may have."""
+    names = [interface.name for interface in design.interface]
+    if primitive.interface not in names:
+        raise _not_stated(primitive, f"it has no [[interface]] {primitive.interface!r}")
+    row = tables["interface"][names.index(primitive.interface)]
+    # the springs as the file has them now, perhaps changed by an earlier primitive
+    springs = dict(zip(INTERFACE_MOTIONS, Interface(**row).springs, strict=True))
+    compliance = primitive.compliance
+    if springs[primitive.motion] > 0.0:
+        compliance += 1.0 / springs[primitive.motion]
+    springs[primitive.motion] = 1.0 / compliance
+    for key, motions in SPRING_KEYS.items():
+        values = [springs[motion] for motion in motions]
+        if any(values):
+            row[key] = values if len(values) > 1 else values[0]
 
 
 def _add_mass(tables: Tables, mesh: StructureMesh, primitive: PlaceMass) -> None:

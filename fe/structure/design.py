@@ -244,6 +244,52 @@ class Support(tables.DesignSection):
             yield is_held_twice, f"the motion {motion} is held, so that no spring can act on it"
 
 
+Stiff = Annotated[float, Field(gt=0.0, le=1e15)]
+Pair = Stiff | tuple[Spring, Spring]
+
+
+class Interface(tables.Named):
+    """Interface of two parts that touch: a joint, a bonded or a bolted contact, which may yield.
+
+    The second part moves against the first one as a rigid body there, by motions against springs.
+    A motion without a spring is held, as in a mesh without the interface.
+    """
+
+    parts: tuple[SetName, SetName]
+    """Two sets of cells that share nodes, or have nodes at the same places."""
+    normal: Stiff | None = None
+    """Spring against a shift along the normal of the interface [N/m]."""
+    tangential: Pair | None = None
+    """Spring against shifts in the interface, or two: along its longer and its shorter extent, zero
+    where held [N/m]."""
+    twist: Stiff | None = None
+    """Spring against a turn about the normal [N m/rad]."""
+    bending: Pair | None = None
+    """Spring against turns about axes in the interface, or two: about its longer and its shorter
+    extent, zero where held [N m/rad]."""
+    scaled_by: tables.Name | None = None
+    """Name of the parameter that scales the springs."""
+
+    def checks(self) -> Iterator[Check]:
+        """Yield the checks against equal parts, and a parameter that scales nothing."""
+        yield from super().checks()
+        first, second = self.parts
+        yield first == second, "two different parts are expected"
+        yield (
+            self.scaled_by is not None and not any(self.springs),
+            "`scaled_by` scales springs, and it has none",
+        )
+
+    @property
+    def springs(self) -> tuple[float, ...]:
+        """The springs against `tables.INTERFACE_MOTIONS` [N/m, N m/rad], zero where held."""
+        in_plane, about_plane = [
+            spring if isinstance(spring, tuple) else (spring or 0.0,) * 2
+            for spring in (self.tangential, self.bending)
+        ]
+        return (self.normal or 0.0, *in_plane, self.twist or 0.0, *about_plane)
+
+
 class MeshLoad(tables.AlternativeKeys, tables.ControlledLoad):
     """A load, constant or times the value of a control.
 
@@ -331,6 +377,8 @@ class MeshDesign(tables.StructureDesign, Gauged):
     """Materials, which cover every cell once."""
     support: tuple[Support, ...] = Field(min_length=1)
     """Supports."""
+    interface: tuple[Interface, ...] = ()
+    """Interfaces at which two parts may move against each other."""
     load: tuple[MeshLoad, ...] = ()
     damage: tuple[Damage, ...] = Field(default=(), max_length=MOST_REGIONS)
     stiffness_loss: tuple[StiffnessLoss, ...] = ()
@@ -342,8 +390,8 @@ class MeshDesign(tables.StructureDesign, Gauged):
     port: tuple[MeshPort, ...] = ()
 
     what = "mesh"
-    scaled_tables = ("material", "support")
-    own_names = ("material", "set")
+    scaled_tables = ("material", "support", "interface")
+    own_names = ("material", "set", "interface")
 
     @property
     def files(self) -> tuple[str, ...]:
@@ -394,8 +442,9 @@ def load_structure(path: Path | str) -> MeshDesign | MatrixDesign:
 
 def _remove_later_keys(content: dict[str, Any]) -> None:
     """Remove keys without a value that files of earlier versions cannot have, from plain data."""
-    if not content.get("stiffness_loss"):
-        content.pop("stiffness_loss", None)
+    for key in ("stiffness_loss", "interface"):
+        if not content.get(key):
+            content.pop(key, None)
     for table, key in (("support", "scaled_by"), ("set", "numbers")):
         for row in content.get(table, ()):
             if row.get(key) is None:

@@ -7,7 +7,7 @@ from typing import NamedTuple, TypeVar
 
 import numpy as np
 
-from fe.elements.cells import CellMesh
+from fe.elements.cells import CellMesh, OuterFaces
 from fe.runtime.arrays import FloatArray, IntArray
 from fe.runtime.errors import MeshError
 from reporting.words import comma_list
@@ -51,6 +51,27 @@ class Spheres(NamedTuple):
     radius: FloatArray
 
 
+class MeshInterface(NamedTuple):
+    """An interface between two parts, each of which has nodes of its own there.
+
+    Attributes
+    ----------
+    nodes, copies : (m,) array of int
+        Nodes of the first part, and those of the second part at the same places.
+    centre : (3,) array
+        Centre of the faces between them [m].
+    axes : (3, 3) array
+        Rows: unit vectors along the normal, which points to the second part, and along the longer
+        and the shorter extent.
+    """
+
+    name: str
+    nodes: IntArray
+    copies: IntArray
+    centre: FloatArray
+    axes: FloatArray
+
+
 @dataclass(frozen=True)
 class StructureMesh(CellMesh):
     """The mesh of a file, in metres, without nodes that no cell uses.
@@ -73,6 +94,8 @@ class StructureMesh(CellMesh):
         Numbers of the nodes that no cell uses.
     remarks : tuple of str
         Sentences for the user on how the file was read.
+    interfaces : tuple of MeshInterface
+        Interfaces at which two parts may move against each other.
     """
 
     source: str
@@ -85,11 +108,32 @@ class StructureMesh(CellMesh):
     face_sets: dict[str, frozenset[tuple[int, ...]]]
     loose: IntArray
     remarks: tuple[str, ...] = ()
+    interfaces: tuple[MeshInterface, ...] = ()
 
     @cached_property
     def size(self) -> float:
         """Diagonal of the structure's bounding box [m]."""
         return float(np.linalg.norm(np.ptp(self.points, axis=0)))
+
+    @cached_property
+    def joined_nodes(self) -> IntArray:
+        """The node (nn,) that each node follows at an interface, itself elsewhere."""
+        nodes = np.arange(len(self.points))
+        for interface in self.interfaces:
+            nodes[interface.copies] = interface.nodes
+        return nodes
+
+    @cached_property
+    def outer_faces(self) -> OuterFaces:
+        """The faces that belong to one cell only, without those at interfaces."""
+        joined_cells = self.joined_nodes[self.cells]
+        joined_faces = CellMesh(self.kind, self.points, joined_cells).outer_faces
+        corners = np.full_like(joined_faces.corners, -1)
+        for number, face in enumerate(self.kind.faces):
+            rows = np.flatnonzero(joined_faces.number == number)
+            own_corners = self.cells[joined_faces.cell[rows]][:, list(face)]
+            corners[rows, -len(face) :] = np.sort(own_corners, axis=1)
+        return OuterFaces(joined_faces.cell, joined_faces.number, corners)
 
     @property
     def boundary(self) -> Surface:

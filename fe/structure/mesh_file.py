@@ -31,7 +31,9 @@ LARGEST_EDGE_SHIFT = 0.3
 
 
 @np.errstate(over="ignore", invalid="ignore")  # an overflow makes the Jacobian fail its check
-def read_mesh(path: Path, unit: float, unit_name: str) -> StructureMesh:
+def read_mesh(
+    path: Path, unit: float, unit_name: str, *, in_one_piece: bool = True
+) -> StructureMesh:
     """Read a mesh file, in a format given by its extension, and check its mesh.
 
     Parameters
@@ -40,6 +42,8 @@ def read_mesh(path: Path, unit: float, unit_name: str) -> StructureMesh:
         The file's unit of length [m].
     unit_name : str
         The name of the unit.
+    in_one_piece : bool
+        Whether a mesh that falls into parts is refused. If not, call `check_connected` later.
 
     Raises
     ------
@@ -58,7 +62,8 @@ def read_mesh(path: Path, unit: float, unit_name: str) -> StructureMesh:
     mesh = reader(path).mesh(unit, unit_name)
     _check_edges(mesh)
     _check_jacobians(mesh)
-    _check_connected(mesh)
+    if in_one_piece:
+        check_connected(mesh)
     return mesh
 
 
@@ -112,17 +117,20 @@ def _remedy_of_bad_elements(mesh: StructureMesh) -> str:
     return "Mesh the part again there, or correct the order of the nodes of these elements."
 
 
-def _check_connected(mesh: StructureMesh) -> None:
-    """Raise `MeshError` if the mesh falls into parts that share no node."""
+def check_connected(mesh: StructureMesh) -> None:
+    """Raise `MeshError` if the mesh falls into parts that share no node and no interface."""
     # graph from the first node of each element to its other nodes
-    first_nodes = np.repeat(mesh.cells[:, :1], mesh.cells.shape[1], axis=1)
-    ones = np.ones(mesh.cells.size, dtype=np.int8)
-    links = (ones, (first_nodes.ravel(), mesh.cells.ravel()))
+    cells = mesh.joined_nodes[mesh.cells]
+    first_nodes = np.repeat(cells[:, :1], cells.shape[1], axis=1)
+    ones = np.ones(cells.size, dtype=np.int8)
+    links = (ones, (first_nodes.ravel(), cells.ravel()))
     graph = sparse.coo_array(links, shape=(len(mesh.points), len(mesh.points)))
-    part_count, part_of_node = csgraph.connected_components(graph, directed=False)
+    _, part_of_node = csgraph.connected_components(graph, directed=False)
+    # nodes that follow others at an interface are parts of their own in the graph
+    parts, part_of_cell = np.unique(part_of_node[cells[:, 0]], return_inverse=True)
+    part_count = len(parts)
     if part_count == 1:
         return
-    part_of_cell = part_of_node[mesh.cells[:, 0]]
     cell_counts = np.bincount(part_of_cell, minlength=part_count)
     smallest_part = cell_counts.argmin()
     first_cell = int((part_of_cell == smallest_part).argmax())

@@ -26,10 +26,11 @@ from .design import (
     structure_hash,
 )
 from .gauges import gauge_rows, strain_factors
+from .interfaces import with_interfaces
 from .matrices import assemble_matrices
 from .matrix_design import MatrixDesign
 from .mesh import StructureMesh
-from .mesh_file import check_memory, read_mesh
+from .mesh_file import check_connected, check_memory, read_mesh
 from .nodal_loads import nodal_load, point_weights, port_row
 from .supports import Supports, supports_of_design
 from .vtu import write_vtu
@@ -62,7 +63,7 @@ class Structure(AffineStructure):
 
 
 def structure_mesh(design: MeshDesign, file: Path) -> StructureMesh:
-    """Read the mesh of a design, and add the sets that the design defines.
+    """Read the mesh of a design, and add the sets and the interfaces that the design defines.
 
     The path of the mesh is relative to `file`, the path of the design's file.
 
@@ -71,7 +72,12 @@ def structure_mesh(design: MeshDesign, file: Path) -> StructureMesh:
     MeshError
         If the mesh cannot be read or is faulty.
     """
-    mesh = read_mesh(file.parent / design.mesh, design.unit, design.length_unit)
+    mesh = read_mesh(
+        file.parent / design.mesh,
+        design.unit,
+        design.length_unit,
+        in_one_piece=not design.interface,
+    )
     node_sets = dict(mesh.node_sets)
     cell_sets = dict(mesh.cell_sets)
     tolerance = 1e-9 * mesh.size
@@ -87,7 +93,9 @@ def structure_mesh(design: MeshDesign, file: Path) -> StructureMesh:
         is_above_low = (points >= low - tolerance).all(axis=1)
         is_below_high = (points <= high + tolerance).all(axis=1)
         sets[named_set.name] = np.flatnonzero(is_above_low & is_below_high)
-    return replace(mesh, node_sets=node_sets, cell_sets=cell_sets)
+    mesh = with_interfaces(replace(mesh, node_sets=node_sets, cell_sets=cell_sets), design)
+    check_connected(mesh)
+    return mesh
 
 
 def _indices_of(numbers: IntArray, named_set: NamedSet, where: str) -> IntArray:

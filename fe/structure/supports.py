@@ -12,6 +12,7 @@ from fe.runtime.errors import MeshError
 
 from .affine import SupportMotion
 from .design import MeshDesign, Support
+from .interfaces import interface_motions
 from .mesh import StructureMesh
 from .nodal_loads import set_weights
 from .tables import MOTIONS
@@ -192,9 +193,13 @@ def supports_of_design(
     for springs in (nodal.springs, *nodal.scaled_springs.values()):
         springs[nodal.held] = 0.0
     _check_no_shared_nodes(mesh, nodal, bodies)
+    _check_free_interfaces(mesh, nodal, bodies)
     rigid_sets = tuple(bodies.values())
     _check_rigid_motions(mesh, nodal, rigid_sets)
-    held_supports = supports(mesh.points, nodal.held, nodal.springs, rigid_sets)
+    follows = mesh.joined_nodes != np.arange(len(mesh.points))
+    held_supports = supports(
+        mesh.points, nodal.held | follows[:, np.newaxis], nodal.springs, rigid_sets
+    )
     # the motions of rigid sets against springs are free unknowns, after the displacements of nodes
     sets_of_bodies = [
         support.set for _, support in design.numbered("support") if support.rigid_about is not None
@@ -204,6 +209,7 @@ def supports_of_design(
     held_supports = held_supports._replace(
         motions=sprung, scaled_springs=_scaled_springs(held_supports, nodal, rigid_sets)
     )
+    held_supports = _with_interface_springs(held_supports, mesh, design)
     if not yielding:
         return held_supports
     # the motions that are held, as further unknowns
@@ -212,6 +218,9 @@ def supports_of_design(
         for number in np.flatnonzero(body.held).tolist():
             column = _body_expansion(mesh.points, body, np.arange(len(MOTIONS)) == number)
             held[set_name, MOTIONS[number]] = column
+    for motion in interface_motions(mesh, design):
+        if motion.spring == 0.0:
+            held[motion.interface, motion.motion] = motion.displacements
     return _with_unknown_motions(held_supports, held)
 
 
@@ -232,6 +241,40 @@ def _scaled_springs(
             of_parameter[first_of_body : first_of_body + len(springs)] += springs
         first_of_body += len(springs)
     return springs_of_parameters
+
+
+def _with_interface_springs(
+    held_supports: Supports, mesh: StructureMesh, design: MeshDesign
+) -> Supports:
+    """Append the motions of interfaces that have springs; copied nodes follow their originals."""
+    if not mesh.interfaces:
+        return held_supports
+    count = len(mesh.points)
+    followed = (np.ones(count), (np.arange(count), mesh.joined_nodes))
+    follows = sparse.csr_array(followed, shape=(count, count))
+    expansion = sparse.kron(follows, sparse.eye_array(3)) @ held_supports.expansion
+    sprung = [motion for motion in interface_motions(mesh, design) if motion.spring > 0.0]
+    first = expansion.shape[1]
+    scaled = {
+        parameter: np.pad(springs, (0, len(sprung)))
+        for parameter, springs in held_supports.scaled_springs.items()
+    }
+    motions = []
+    for unknown, motion in enumerate(sprung, start=first):
+        if motion.scaled_by is not None:
+            scaled.setdefault(motion.scaled_by, np.zeros(first + len(sprung)))
+            scaled[motion.scaled_by][unknown] = motion.spring
+        motions.append(
+            SupportMotion(motion.interface, motion.motion, unknown, motion.spring, motion.scaled_by)
+        )
+    columns = [motion.displacements for motion in sprung]
+    return Supports(
+        expansion=sparse.hstack((expansion, *columns)).tocsr(),
+        free_displacements=held_supports.free_displacements,
+        springs=np.append(held_supports.springs, [motion.spring for motion in sprung]),
+        scaled_springs=scaled,
+        motions=(*held_supports.motions, *motions),
+    )
 
 
 def _sprung_motions(
@@ -319,6 +362,23 @@ def _check_no_shared_nodes(
                 f"too, such as that at {place}; say what holds it in its own table."
             )
         is_supported[body.nodes] = True
+
+
+def _check_free_interfaces(
+    mesh: StructureMesh, nodal: _NodeSupports, bodies: dict[str, RigidSet]
+) -> None:
+    """Raise `MeshError` if a support holds a node of an interface, which could not yield then."""
+    is_supported = np.any(nodal.resists, axis=1)
+    for body in bodies.values():
+        is_supported[body.nodes] = True
+    for interface in mesh.interfaces:
+        pairs = np.concatenate((interface.nodes, interface.copies))
+        supported = pairs[is_supported[pairs]]
+        if len(supported):
+            raise MeshError(
+                f"The interface {interface.name!r} has nodes that a support holds, such as that at "
+                f"{mesh.describe_point(mesh.points[supported[0]])}; take them out of the support."
+            )
 
 
 def _rigid_set(support: Support, mesh: StructureMesh, nodes: IntArray, label: str) -> RigidSet:

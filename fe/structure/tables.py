@@ -21,6 +21,10 @@ UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "in": 0.0254, "ft": 0.304
 MOTIONS = ("x", "y", "z", "rx", "ry", "rz")
 """Motions of a rigid set of nodes: along the axes, then about them."""
 
+INTERFACE_MOTIONS = ("n", "s", "t", "rn", "rs", "rt")
+"""Motions of the second part of an interface against the first one: along the normal, the long and
+the short axis of the interface, then about them."""
+
 
 class DesignSection(Section):
     """Section of a design file; unknown keys and non-finite numbers are refused."""

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from benchmarks.cantilever import LENGTH
 from benchmarks.effect_pages import FOLDER, pages
-from benchmarks.effect_pictures import FLOWS, REGION_LOSSES, draw, picture_setting
+from benchmarks.effect_pictures import EFFECTS_OF_PARTS, FLOWS, draw, picture_setting
 from benchmarks.tank import tank_setting
 from discrepancy.campaign.records import Channel, Quantity, Start, TrialKind
 from discrepancy.catalogue.entry import LEAST_SHRINKAGE, Prior, Setting
@@ -33,7 +33,7 @@ from tests.discrepancy.rigs import INPUTS, asked, campaign, chosen, model_of, se
 pytestmark = pytest.mark.xdist_group("compiling")
 
 # flows need a store (test_outflow), losses of regions a structure with regions (test_regions_of_structures)
-BEAM = [effect for effect in library() if effect.identifier not in (*FLOWS, *REGION_LOSSES)]
+BEAM = [effect for effect in library() if effect.identifier not in (*FLOWS, *EFFECTS_OF_PARTS)]
 WARM = {"thermal_strain", "temperature_dependent_modulus"}
 VANISHING = pytest.mark.parametrize(
     "effect",
@@ -432,7 +432,7 @@ def test_a_chain_is_offered_what_it_can_carry_and_its_records_can_show():
     assert absent == OF_OTHERS | OF_STORES | WARM | {
         "logger_clock",
         "sensor_lag",
-        *REGION_LOSSES,
+        *EFFECTS_OF_PARTS,
     }
     assert (
         reasons["region_stiffness_loss"] == "The model 'Three-mass chain with a joint' has no damage region."

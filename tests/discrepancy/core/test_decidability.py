@@ -17,11 +17,12 @@ from discrepancy.fits.candidate import Candidate, EffectTerm
 from discrepancy.fits.fitting import CandidateFit, fit
 from discrepancy.fits.problem import Problem
 from discrepancy.judgement.next_experiment import (
+    Alternatives,
     Proposal,
     feasible_proposals,
-    mutual_information,
     next_experiments,
     oscillates,
+    worth_of_trial,
 )
 from discrepancy.judgement.separability import (
     CONFUSION_DISTANCE,
@@ -258,13 +259,14 @@ def test_information_of_one_reading_against_quadrature(shift, weight):
     fits = [nothing, replace(offset, point=shifted, covariance=np.diag([1.0, 1.0, 1e-12]))]
     weights = np.array([weight, 1.0 - weight])
     proposal = Proposal(trial, "", "", 1.0)
-    information = mutual_information(problem, proposal, fits, weights)
-    under_a_free_zero = mutual_information(known_closed_form(trial, inf), proposal, fits, weights)
+    alternatives = Alternatives.single(fits, weights)
+    information = worth_of_trial(problem, proposal, alternatives).information
+    under_a_free_zero = worth_of_trial(known_closed_form(trial, inf), proposal, alternatives)
     entropy = -float(weights @ np.log(weights))
     assert 0.0 <= information <= entropy
     # 300 outcomes each: standard error about 0.02
     assert information == pytest.approx(information_in_closed_form(shift, weights), abs=0.06)
-    assert under_a_free_zero < 0.02
+    assert under_a_free_zero.information < 0.02
 
 
 @dataclass(frozen=True)
@@ -275,7 +277,7 @@ class TwoHypotheses:
     fits: list[CandidateFit]
 
     def information(self, proposal):
-        return mutual_information(self.problem, proposal, self.fits, HALF)
+        return worth_of_trial(self.problem, proposal, Alternatives.single(self.fits, HALF)).information
 
     def best_experiments(self):
         return next_experiments(self.problem, [(item, 0.5) for item in self.fits])

@@ -18,6 +18,7 @@ from fe.runtime.arrays import FloatArray
 from fe.runtime.changeable import ChangeableModel, ChangedStructure
 from fe.runtime.errors import InvalidPatchError
 from fe.runtime.patch import (
+    InterfaceCompliance,
     LoadOffset,
     LoadTilt,
     ModelPatch,
@@ -234,6 +235,35 @@ def test_a_support_that_hardly_yields_is_held(slender: Yielding, exponent: float
     held, soft = slender.changed(), slender.changed(SupportCompliance("root", "ry", 10.0**exponent))
     assert soft.modes.frequency == pytest.approx(held.modes.frequency, rel=1e-4)
     assert slender.outputs(soft, PUSH) == pytest.approx(slender.outputs(held, PUSH), rel=1e-4)
+
+
+JOINT = """
+[[interface]]
+name = "joint"
+parts = ["left", "right"]
+tangential = [0, 1e8]
+
+[[material]]"""
+HALVES = """set = [
+    { name = "left", of = "cells", box = [[0, 0, 0], [50, 20, 10]] },
+    { name = "right", of = "cells", box = [[50, 0, 0], [100, 20, 10]] },"""
+
+
+def test_a_joint_that_yields_is_that_of_the_full_model(
+    write_beam: WriteBeam, tmp_path: Path
+) -> None:
+    """A held turn against a spring, and a spring in series with that of the file."""
+    file = write_beam(tmp_path, {"set = [": HALVES, "\n[[material]]": JOINT}, cells=2)
+    jointed = yielding_beam(file)
+    assert jointed.model.change_errors.max() < 1e-3
+    names = list(zip(jointed.model.supports, jointed.model.motions, strict=True))
+    compliances = {"rs": 1.0 / 400.0, "t": 3e-8}
+    soft = jointed.changed(*[InterfaceCompliance("joint", *item) for item in compliances.items()])
+    outputs, frequencies = jointed.full_answers(
+        {names.index(("joint", motion)): value for motion, value in compliances.items()}, PUSH
+    )
+    assert jointed.outputs(soft, PUSH) == pytest.approx(outputs, rel=1e-5)
+    assert soft.modes.frequency == pytest.approx(frequencies, rel=1e-4)
 
 
 def test_compliances_of_one_motion_add_up(flanged: Yielding) -> None:
