@@ -152,8 +152,7 @@ def test_parts_that_do_not_touch_are_refused(
 
 
 def test_a_support_at_the_interface_is_refused(write_beam: WriteBeam, tmp_path: Path) -> None:
-    clamped = {
-        'name = "root", of = "nodes", box = [[0, 0, 0], [0,': 'name = "root", of = "nodes", box = [[0, 0, 0], [50,'
-    }
+    root = 'name = "root", of = "nodes", box = [[0, 0, 0], '
+    clamped = {root + "[0,": root + "[50,"}
     with pytest.raises(MeshError, match="nodes that a support holds"):
         assemble_structure(with_joint(write_beam(tmp_path, SLENDER | clamped)))
