@@ -23,12 +23,8 @@ from discrepancy.fits.problem import Problem
 from discrepancy.fits.screening import Screen
 from discrepancy.judgement.next_experiment import (
     SENSOR_WORDS,
-    Alternatives,
-    Proposal,
-    Worth,
     added_load_worths,
     added_sensor_worths,
-    worth_of_trial,
 )
 from discrepancy.judgement.separability import (
     CONFUSION_DISTANCE,
@@ -37,6 +33,7 @@ from discrepancy.judgement.separability import (
     Separability,
     compute_separability,
 )
+from discrepancy.judgement.trial_worth import Alternatives, Proposal, Worth, worth_of_trial
 from discrepancy.system.structures import StructureModel
 from discrepancy.system.system_state import SystemState
 from fe.reduction.model_cache import changeable_model

@@ -61,7 +61,9 @@ def suspects(
     with stage("What the planned measurement can decide"):
         measurement = PlannedMeasurement(model, Precision(noise, 0.01 * gain), library())
     with stage("Which measurement would decide more"):
-        look_alikes = [measurement.look_alikes(*pair) for pair in measurement.confusions]
+        look_alikes = [
+            measurement.look_alikes(confusion, plan) for confusion, plan in measurement.confusions
+        ]
     rows = _rows(measurement.static, measurement.with_releases)
     if json:
         pairs = [_record_of_pair(pair) for pair in look_alikes]

@@ -18,6 +18,12 @@ from discrepancy.system.mesh_errors import WithMeshErrors, mesh_errors_of
 from discrepancy.system.output_equation import OutputEquation
 from discrepancy.system.response import ACROSS, Conditions, Outputs, Place, Response
 from discrepancy.system.scales import Scales
+from discrepancy.system.structure_rows import (
+    acts_along,
+    displacements_of_places,
+    strains_near_gauges,
+    strains_of_possible_gauges,
+)
 from discrepancy.system.system_model import SystemModel
 from discrepancy.system.system_state import PatchedTrial, SystemState
 from discrepancy.system.time_history import RecordedHistory
@@ -42,10 +48,6 @@ LOAD_FACTOR = "load_factor"
 """Control that is the load factor of flights."""
 DEVIATION = 0.25
 """Standard deviation of a parameter that was not calibrated, as a fraction of its range."""
-ROUNDING = 1e-9
-"""Differences of two rows below this fraction of the largest entry are rounding errors."""
-AXES = ("x", "y", "z")
-"""Axes along which a place of the structure may be measured or loaded."""
 LARGEST_LOSS = 0.7
 """Largest loss of stiffness of a patch that is compared."""
 
@@ -97,9 +99,7 @@ class StructureModel(SystemModel):
     def __init__(self, model: ReducedModel) -> None:
         self.model = model
         self.name = model.name
-        # displacements, or forces of 1 N, at places of the structure, by the name of each
         self._place_rows: dict[str, FloatArray] = {}
-        self._loaded_place: dict[str, str] = {}
         self.regions = model.regions
         self.largest_losses = {region: model.validity[region][1] for region in model.regions}
         self.parameters = _parameter_priors(model)
@@ -132,11 +132,9 @@ class StructureModel(SystemModel):
             self._unit_loads = model.unit_loads
         self._rows = dict(zip(names, rows, strict=True))
         if isinstance(model, ChangeableModel):
-            self._rows |= _strains_near_gauges(model)
+            self._rows |= strains_near_gauges(model)
             self._rows |= self._place_rows
-            for ending, strains in zip(("", *ACROSS), model.possible_gauge_output, strict=True):
-                for gauge, row in zip(model.possible_gauges, strains, strict=True):
-                    self._rows[gauge + ending] = row
+            self._rows |= strains_of_possible_gauges(model)
         displacements = [name for name in model.displacements if not _is_at_port(name)]
         self.quantities = {
             **dict.fromkeys(model.gauges, Quantity.STRAIN),
@@ -176,10 +174,7 @@ class StructureModel(SystemModel):
             )
         )
         self.gauge_shifts = tuple(zip(model.shifted_gauges, model.shift_axes, strict=True))
-        for place, rows in zip(model.mass_places, model.mass_rows, strict=True):
-            for axis, row in zip(AXES, rows, strict=True):
-                self._place_rows[f"{place} along {axis}"] = row
-                self._loaded_place[f"{place} along {axis}"] = place
+        self._place_rows = displacements_of_places(model)
         self.possible_loads = tuple(self._place_rows)
         self.possible_sensors = dict.fromkeys(self._place_rows, Quantity.DISPLACEMENT)
         self.possible_sensors |= dict.fromkeys(model.possible_gauges, Quantity.STRAIN)
@@ -194,7 +189,7 @@ class StructureModel(SystemModel):
         rows: dict[str, FloatArray] = {}
         for unit_load in unit_loads:
             for name in displacements:
-                if _acts_along(unit_load, self._rows[name]):
+                if acts_along(unit_load, self._rows[name]):
                     rows[name] = self._rows[name]
         return rows
 
@@ -212,7 +207,7 @@ class StructureModel(SystemModel):
         Readings could not distinguish the forces at both.
         """
         for other_port, other_row in self.port_rows.items():
-            if _acts_along(row, other_row):
+            if acts_along(row, other_row):
                 raise ModelError(
                     f"The port {port!r} of the structure {self.name} moves exactly as its port "
                     f"{other_port!r} does, so that no reading can distinguish their forces: remove "
@@ -428,9 +423,9 @@ class StructureModel(SystemModel):
         case = super().patched_trial(trial, conditions, patch)
         structure = case.state.structure
         structure += ModelPatch(tuple(filter(self._is_loss_of_patch, patch)))
-        place = self._loaded_place.get(str(trial.load_place))
-        if place is not None:
+        if trial.load_place in self._place_rows:
             # no mass, but the columns of one: the responses to forces at the place
+            place, _, _ = str(trial.load_place).rpartition(" along ")
             structure += ModelPatch((changes.PlaceMass(place, 0.0),))
         return case._replace(state=case.state._replace(structure=structure))
 
@@ -508,36 +503,9 @@ def _parameter_priors(model: ReducedModel) -> tuple[ParameterPrior, ...]:
     return tuple(priors)
 
 
-def _strains_near_gauges(model: ChangeableModel) -> dict[str, FloatArray]:
-    """Return the rows of strains near gauges, by output.
-
-    They are the transverse and the shear strain of a gauge (n,), and for each axis along which a
-    gauge may be shifted, such as `g1.along`, the slope and curvature of its strain (2, n).
-    """
-    rows = {}
-    for ending, strain_rows in zip(ACROSS, model.across_output, strict=True):
-        for gauge, row in zip(model.gauges[: len(strain_rows)], strain_rows, strict=True):
-            rows[gauge + ending] = row
-    shifts = zip(model.shifted_gauges, model.shift_axes, model.shift_output, strict=True)
-    rows |= {f"{gauge}.{axis}": derivatives for gauge, axis, derivatives in shifts}
-    return rows
-
-
 def _is_at_port(name: str) -> bool:
     """Return whether a control or a displacement acts at a port of the structure file."""
     return name.startswith(PORT_PREFIX)
-
-
-def _acts_along(load: FloatArray, row: FloatArray) -> bool:
-    """Return whether a load (n,) is a multiple of the row (n,) of a displacement, up to rounding.
-
-    A load of zeros is not.
-    """
-    largest_entry = float(np.abs(load).max())
-    factor = float(load @ row) / (float(row @ row) or 1.0)  # of least squares
-    return (
-        largest_entry > 0.0 and float(np.abs(load - factor * row).max()) <= ROUNDING * largest_entry
-    )
 
 
 def linear_system(

@@ -230,14 +230,13 @@ class ChangeableModel(ReducedModel):
 
     def _axis_lengths(self) -> dict[str, int]:
         size = len(self.column_owner)
-        places = len(self.supports) + len(self.mass_places) + len(self.loss_places)
         return super()._axis_lengths() | {
             "masses added": len(self.mass_places),
             "gauges that may be added": len(self.possible_gauges),
             "changed loads": len(self.load_controls),
             "gauge shifts": len(self.shifted_gauges),
             "triangle": size * (size + 1) // 2,
-            "changes": places,
+            "changes": len(self.supports) + len(self.mass_places) + len(self.loss_places),
         }
 
     def changes_of(self, patch: Iterable[Primitive]) -> "StructuralChanges":
@@ -257,22 +256,17 @@ class ChangeableModel(ReducedModel):
         remaining_fractions: dict[int, float] = {}
         for primitive in patch:
             if isinstance(primitive, SupportCompliance | InterfaceCompliance):
-                if isinstance(primitive, SupportCompliance):
-                    kind, name = "support", primitive.support
-                else:
-                    kind, name = "interface", primitive.interface
                 if primitive.compliance < 0.0:
                     raise InvalidPatchError(
-                        f"The compliance of the {kind} {name!r} must not be negative, but is "
+                        f"The compliance of {primitive.location!r} must not be negative, but is "
                         f"{primitive.compliance:g}."
                     )
-                number = 1 + self.support_number(name, primitive.motion)
+                number = 1 + self.support_number(primitive.location, primitive.motion)
                 compliances[number] = compliances.get(number, 0.0) + primitive.compliance
             elif isinstance(primitive, PlaceMass):
-                first_number = 1 + len(self.supports)
                 place = self._place_number(self.mass_places, primitive.place, "a mass")
                 self._check_distances(primitive, float(self.mass_reaches[place]))
-                number = first_number + place
+                number = 1 + len(self.supports) + place
                 masses.append(AddedMass(number, primitive.mass, primitive.along, primitive.across))
             elif isinstance(primitive, RegionStiffnessLoss):
                 if not 0.0 <= primitive.loss < 1.0:
@@ -285,13 +279,10 @@ class ChangeableModel(ReducedModel):
                         f"The extent of the loss of {primitive.region!r} must be positive, but is "
                         f"{primitive.extent:g}."
                     )
-                first_number = 1 + len(self.supports) + len(self.mass_places)
-                number = first_number + self._place_number(
-                    self.loss_places, primitive.region, "a loss"
-                )
-                remaining_fractions[number] = remaining_fractions.get(number, 1.0) * (
-                    1.0 - primitive.loss
-                )
+                place = self._place_number(self.loss_places, primitive.region, "a loss")
+                number = 1 + len(self.supports) + len(self.mass_places) + place
+                remaining_fractions.setdefault(number, 1.0)
+                remaining_fractions[number] *= 1.0 - primitive.loss
         losses = {number: 1.0 - fraction for number, fraction in remaining_fractions.items()}
         return StructuralChanges(compliances, tuple(masses), losses)
 
@@ -324,10 +315,9 @@ class ChangeableModel(ReducedModel):
         """
         factor = 1.0
         number = int(self.patch_of_gauge[self.gauges.index(gauge)])
+        place = self.loss_places[number] if number >= 0 else None
         for primitive in patch:
-            if isinstance(primitive, RegionStiffnessLoss) and (
-                number >= 0 and primitive.region == self.loss_places[number]
-            ):
+            if isinstance(primitive, RegionStiffnessLoss) and primitive.region == place:
                 factor *= primitive.strain_over_mean
         return factor
 

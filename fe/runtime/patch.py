@@ -97,6 +97,11 @@ class SupportCompliance(Primitive):
     compliance: Annotated[float, "m/N or rad/(N m)"]
     """Motion of the support for each unit of its reaction."""
 
+    @property
+    def location(self) -> str:
+        """The support."""
+        return self.support
+
 
 class InterfaceCompliance(Primitive):
     """An interface of two parts yields: a motion that it holds is against a spring.
@@ -112,6 +117,11 @@ class InterfaceCompliance(Primitive):
     """Motion of the second part against the first one: "n", "s", "t", or "rn", "rs", "rt"."""
     compliance: Annotated[float, "m/N or rad/(N m)"]
     """Added compliance."""
+
+    @property
+    def location(self) -> str:
+        """The interface."""
+        return self.interface
 
 
 class LocalStiffnessLoss(Primitive):

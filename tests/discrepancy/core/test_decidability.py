@@ -16,20 +16,14 @@ from discrepancy.campaign.records import Campaign, Channel, NoiseRecord, Quantit
 from discrepancy.fits.candidate import Candidate, EffectTerm
 from discrepancy.fits.fitting import CandidateFit, fit
 from discrepancy.fits.problem import Problem
-from discrepancy.judgement.next_experiment import (
-    Alternatives,
-    Proposal,
-    feasible_proposals,
-    next_experiments,
-    oscillates,
-    worth_of_trial,
-)
+from discrepancy.judgement.next_experiment import feasible_proposals, next_experiments, oscillates
 from discrepancy.judgement.separability import (
     CONFUSION_DISTANCE,
     DETECTION_DISTANCE,
     campaign_as_predicted,
     compute_separability,
 )
+from discrepancy.judgement.trial_worth import Alternatives, Proposal, worth_of_trial
 from discrepancy.report.decidability_text import group_lines
 from discrepancy.self_calibration import SelfCalibration, outcome_of, self_calibrate, wilson_interval
 from discrepancy.self_calibration_file import self_calibration_schema, write_self_calibration
