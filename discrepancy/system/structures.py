@@ -477,13 +477,10 @@ class StructureModel(SystemModel):
         # (support motions, loads + modes)
         gains = self.model.compliance_gains(self._input_vector(state, {}))
         largest_gains = gains.max(axis=1, initial=0.0).tolist()
+        motions = zip(self.model.supports, self.model.motions, strict=True)
         compliances = {
             motion: 1.0 / gain if gain > 0.0 else 1.0
-            for motion, gain in zip(
-                zip(self.model.supports, self.model.motions, strict=True),
-                largest_gains,
-                strict=True,
-            )
+            for motion, gain in zip(motions, largest_gains, strict=True)
         }
         return replace(scales, support_compliances=compliances)
 
