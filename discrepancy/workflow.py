@@ -320,7 +320,7 @@ def _laws_leave_no_force(verdict: Verdict, search: Search, fit: CandidateFit) ->
     they are simulated. Otherwise the estimate of the missing force beside these effects decides.
     """
     terms = fit.candidate.terms
-    has_law = any(term.place in search.problem.model.ports for term in terms)
+    has_law = any(term.port in search.problem.model.ports for term in terms)
     acts_throughout = not any(term.effect.variant_of for term in terms)
     if not has_law or not acts_throughout:
         return False

@@ -11,6 +11,7 @@ from math import inf
 import numpy as np
 
 from discrepancy.campaign.records import BoolArray, FloatArray, TrialKind
+from discrepancy.catalogue.effect_in_setting import SIDES
 from discrepancy.catalogue.entry import Effect, EffectParameter, Setting, ShapeParameter
 from discrepancy.verdict import FREE_SHAPE
 from fe.runtime.patch import ModelPatch
@@ -47,6 +48,12 @@ class EffectTerm:
         if self.free_shape:
             return self.effect.identifier + FREE_SHAPE
         return self.effect.identifier
+
+    @property
+    def port(self) -> str:
+        """The port at which a law of the effect acts: the place, without the side of a crack."""
+        port, _, side = self.place.rpartition(", ")
+        return port if side in SIDES else self.place
 
     @property
     def name_in_words(self) -> str:

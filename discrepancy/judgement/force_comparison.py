@@ -154,7 +154,7 @@ class ForceComparison(Comparison[Estimate]):
         If no law acts at a port, it is that of the first missing force.
         """
         ports = self.force_search.ported.ports
-        law_ports = [term.place for term in hypothesis.candidate.terms if term.place in ports]
+        law_ports = [term.port for term in hypothesis.candidate.terms if term.port in ports]
         port = law_ports[0] if law_ports else ports[next(iter(hypothesis.processes))]
         force_unit, *_ = self.problem.model.port_units(port)
         return force_unit

@@ -257,7 +257,7 @@ def missing_force(search: ForceSearch, estimate: Estimate) -> MissingForce | Non
     if max(evidence_by_port.values()) < LEAST_EVIDENCE:
         return None
     terms = estimate.candidate.terms
-    law_ports = {term.place for term in terms if term.place in search.ported.ports}
+    law_ports = {term.port for term in terms if term.port in search.ported.ports}
     if len(law_ports) == 1:
         (port,) = law_ports
     else:
@@ -267,7 +267,7 @@ def missing_force(search: ForceSearch, estimate: Estimate) -> MissingForce | Non
     if number not in estimate.processes:
         estimate = search.estimate_by_port[port]
     law_name = " and ".join(
-        term.name_in_words for term in estimate.candidate.terms if term.place == port
+        term.name_in_words for term in estimate.candidate.terms if term.port == port
     )
     recorded = {trial.name: trial for trial in search.ported.problem.campaign.trials}
     trial_forces = _with_history_of_motion(
@@ -471,7 +471,7 @@ def missing_force_of_verdict(
     terms = fit.candidate.terms
     try:
         ports = problem.model.ports
-        laws = [term for term in terms if term.place in ports]
+        laws = [term for term in terms if term.port in ports]
         if not can_estimate_forces(problem) or (terms and not laws and is_named):
             return None
         search = search or ForceSearch(problem)
@@ -485,7 +485,7 @@ def missing_force_of_verdict(
     if force is None or not force.law or estimate is None:
         return force
     at_port = force.at_port
-    if len({law.place for law in laws}) > 1:
+    if len({law.port for law in laws}) > 1:
         names_at_ports = [f"{law.name_in_words} at {law.place}" for law in laws]
         at_port = replace(at_port, law=" and ".join(names_at_ports))
     if estimate.leaves_no_force:

@@ -123,8 +123,8 @@ class ForceShares:
     def _law_ports(self, estimate: Estimate) -> set[int]:
         """Return the numbers of the ports at which a hypothesis has laws."""
         names = self.search.ported.ports
-        places = [term.place for term in estimate.candidate.terms]
-        return {names.index(place) for place in places if place in names}
+        ports = [term.port for term in estimate.candidate.terms]
+        return {names.index(port) for port in ports if port in names}
 
     def _block_sums(
         self,

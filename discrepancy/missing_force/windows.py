@@ -129,7 +129,7 @@ def _evidence_of_law(search: ForceSearch, port: str, fit: CandidateFit) -> float
     These laws alone are fitted to the missing force at the port. The evidence is -inf if the fit
     has no law there, or if they cannot be fitted.
     """
-    terms_at_port = [index for index, term in enumerate(fit.candidate.terms) if term.place == port]
+    terms_at_port = [index for index, term in enumerate(fit.candidate.terms) if term.port == port]
     if not terms_at_port:
         return -np.inf
     laws_at_port, parameters = fit.candidate.subset_of_terms(terms_at_port, fit.effect)

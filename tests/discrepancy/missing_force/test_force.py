@@ -614,3 +614,9 @@ def test_a_gain_error_acts_on_the_motion_of_the_model_and_not_on_that_by_a_missi
     assert np.abs(moved.added_state).max() > 0.0
     assert np.abs(changes[0]).max() > 0.0
     np.testing.assert_array_equal(changes[0], changes[1])
+
+
+def test_a_crack_acts_at_the_port_of_its_place():
+    (crack,) = chosen("breathing_crack")
+    assert EffectTerm(crack, "mass, open at positive x").port == "mass"
+    assert EffectTerm(crack, "root, lower skin").port == "root, lower skin"
