@@ -195,7 +195,8 @@ def test_modules_and_functions_are_short_or_say_why_not():
     long: dict[str, int] = {}
     for path in source_files().values():
         place = path.relative_to(ROOT).as_posix()
-        if code_lines(path) > LONGEST_MODULE:
+        line_count = len(path.read_bytes().splitlines())  # code takes no more lines than all takes
+        if line_count > LONGEST_MODULE and code_lines(path) > LONGEST_MODULE:
             long[place] = code_lines(path)
         for node in nodes(path):
             if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef) and lines(node) > LONGEST_FUNCTION:
