@@ -549,6 +549,7 @@ def test_a_run_whose_policy_was_changed_is_not_resumed(gentle_run, tmp_path):
 PACKAGES = ("calibration", "discrepancy", "fe", "fmu_asset", "reporting", "twin_master", "uav_twin")
 
 
+@once
 def classes_of_packages() -> dict[str, bool]:
     """Return the public classes of the packages by name, and whether each is a protocol."""
     classes = {}
