@@ -166,11 +166,11 @@ class Estimate:
         return added_covariance
 
     def _force_by_parameter(self, port: int) -> FloatArray:
-        """Return the forces (E, T) for a unit of each effect parameter at a port.
+        """Return the forces (E, T) at a port caused by a unit change of each effect parameter.
 
-        T is the number of samples of all trials together.
+        There are E effect parameters, and T samples in all trials together.
         """
-        first_effect = len(self.shared)
+        first_effect = len(self.shared)  # shared unknowns come first, then effect parameters
         by_trial = []
         for linear_trial in self.linearisation.trials:
             trial = linear_trial.trial
@@ -198,7 +198,7 @@ def estimate_of_processes(
     linearisation : Linearisation
         The trials, along a motion that was estimated before.
     median_processes : mapping of int to Process
-        The prior medians of the missing forces, by the numbers of their ports.
+        The prior medians of the missing forces, by the index of the port.
     initial_processes : mapping of int to Process
         The missing forces with which the search for the most probable ones begins.
     skip_grid : bool

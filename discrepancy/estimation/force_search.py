@@ -182,7 +182,8 @@ class ForceSearch:
     def estimate_with_jumps(self, port: str) -> Estimate:
         """Return the missing force at a port as a process that may jump.
 
-        The trials are linearised twice, the second time about the motion of the first estimate.
+        The trials are linearised twice: about the estimate without jumps, and again about the first
+        estimate with jumps, whose unknowns may differ.
 
         Parameters
         ----------
@@ -192,35 +193,38 @@ class ForceSearch:
         estimate = self.estimate_by_port[port]
         for _ in range(2):
             jumping_processes = {
-                number: replace(process, may_jump=True)
-                for number, process in estimate.processes.items()
+                port_index: replace(process, may_jump=True)
+                for port_index, process in estimate.processes.items()
             }
+            linearisation_point = self.ported.point_of(estimate)
             estimate = self._estimate_along_motion(
-                self.ported.trial_set.trials_about(self.ported.point_of(estimate)),
-                jumping_processes,
-                self.ported.prior_processes(jumping_processes),
+                trials=self.ported.trial_set.trials_about(linearisation_point),
+                initial_processes=jumping_processes,
+                prior_medians=self.ported.prior_processes(jumping_processes),
             )
         return estimate
 
     def _estimate_along_motion(
         self,
         trials: tuple[LinearTrial, ...],
-        first_processes: Processes,
+        initial_processes: Processes,
         prior_medians: dict[int, Process],
         *,
         skip_grid: bool = False,
     ) -> Estimate:
-        """Return the most probable missing forces along the motion that first forces give.
+        """Smooth the motion with the initial processes, and return the most probable ones along it.
 
-        The search begins at the best point of a grid around the first forces or, with `skip_grid`,
-        at these forces.
+        The search begins at the best point of a grid around the initial processes or, with
+        `skip_grid`, at these themselves.
         """
+        # the motion first, from the linear model without its own laws
         linearisation = plain_linearisation(trials, self.ported.shared_priors)
-        solution, smoothed_trials = linearisation.solve_and_smooth(first_processes)
+        solution, smoothed_trials = linearisation.solve_and_smooth(initial_processes)
         trajectories = tuple(trial.trajectory for trial in smoothed_trials)
-        along_motion = self.ported.linearise(trials, trajectories, solution.mean)
+        # then the model's own laws, linearised along this motion
+        linearisation_along_motion = self.ported.linearise(trials, trajectories, solution.mean)
         return estimate_of_processes(
-            along_motion, prior_medians, first_processes, skip_grid=skip_grid
+            linearisation_along_motion, prior_medians, initial_processes, skip_grid=skip_grid
         )
 
     def _linearise_along(self, estimate: Estimate) -> Linearisation:

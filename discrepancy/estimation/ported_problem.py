@@ -114,19 +114,28 @@ class PortedProblem:
         return linearisation or plain_linearisation(trials, self.shared_priors)
 
     def prior_processes(self, ports: Iterable[int]) -> dict[int, Process]:
-        """Return the prior medians of missing forces, by the number of the port.
+        """Return the prior medians of the missing forces at ports, by the index of the port.
 
         The median standard deviation is 5 % of the elastic force at the port. The median
         correlation time is the time in which the vibration advances by one radian, or the duration
         of the trials if the port has no frequency.
+
+        Parameters
+        ----------
+        ports : iterable of int
+            Indices into `ports`.
         """
         scales = self.problem.setting.scales
         processes = {}
-        for port in ports:
-            scale = scales.ports[self.ports[port]]
+        for port_index in ports:
+            port_name = self.ports[port_index]
+            scale = scales.ports[port_name]
             rate = scale.angular_frequency or 1.0 / scales.duration
-            # 5 % of the elastic force is a small gap; the prior also allows far larger and smaller
-            processes[port] = Process(0.05 * scale.stiffness * scale.displacement, 1.0 / rate)
+            # the prior also allows forces that are far larger and far smaller than 5 %
+            elastic_force = scale.stiffness * scale.displacement
+            processes[port_index] = Process(
+                standard_deviation=0.05 * elastic_force, correlation_time=1.0 / rate
+            )
         return processes
 
     def evaluate_model_laws(self, shared_values: FloatArray) -> ModelPatch:

@@ -45,9 +45,9 @@ class Priors:
         return len(self.precision)
 
     def of(self, unknowns: Sequence[int]) -> "Priors":
-        """Return the priors of some of the unknowns, given by their numbers."""
-        numbers = np.asarray(unknowns, dtype=np.intp)
-        return Priors(self.precision[numbers], self.low[numbers], self.high[numbers])
+        """Return the priors of some of the unknowns, given by their indices."""
+        indices = np.asarray(unknowns, dtype=np.intp)
+        return Priors(self.precision[indices], self.low[indices], self.high[indices])
 
     def followed_by(self, others: "Priors") -> "Priors":
         """Return the priors of these unknowns and others after them."""
@@ -102,8 +102,8 @@ class Regression:
     Attributes
     ----------
     products : (1 + K, 1 + K) ndarray
-        The inner products of the whitened residual (first) and of the whitened columns of the
-        unknowns. Unknowns of single trials have been eliminated.
+        The Gram matrix of the whitened residual (first) and the whitened columns of the unknowns.
+        Unknowns of single trials have been eliminated.
     half_log_determinant : float
         Half the log determinant of the covariance of the readings, with the contribution of the
         eliminated unknowns [nat].
@@ -115,14 +115,27 @@ class Regression:
     def solve(self, unknowns: Sequence[int], priors: Priors) -> Solution:
         """Solve the linear model for some of its unknowns, with all other unknowns at zero.
 
-        `unknowns` are their numbers, and `priors` are theirs. The solution is within their ranges.
-        The log evidence is -inf if rounding errors exceed `LARGEST_ROUNDING`.
+        The model is r = X u + white noise of unit variance, with the whitened residual r, the
+        chosen columns X and the unknowns u. The normal equations are (X^T X + P) mean = X^T r with
+        the prior precisions P. The solution is within the ranges of the unknowns.
+
+        Parameters
+        ----------
+        unknowns : sequence of int
+            The indices of the k unknowns to solve for, 0 to K - 1.
+        priors : Priors
+            The priors of these k unknowns in the same order, with mean zero.
+
+        Returns
+        -------
+        Solution
+            Its log evidence is -inf if rounding errors exceed `LARGEST_ROUNDING`.
         """
-        # the row and column of the residual come first, then those of the chosen unknowns
+        # `products` is the Gram matrix of [r, X]: the residual comes first
         rows = np.array([0, *(1 + unknown for unknown in unknowns)])
         products = self.products[np.ix_(rows, rows)]
-        products_of_unknowns = products[1:, 1:]
-        right_side = products[1:, 0]
+        products_of_unknowns = products[1:, 1:]  # X^T X
+        right_side = products[1:, 0]  # X^T r
         prior_precision = np.maximum(priors.precision, LEAST_PRECISION)
         # columns may be of any scale and nearly equal: scale the normal equations to unit diagonal
         column_scale = 1.0 / np.sqrt(np.diag(products_of_unknowns) + prior_precision)
@@ -132,7 +145,8 @@ class Regression:
         cholesky, is_lower = cho_factor(normal_matrix + ROUNDING * identity)
         mean = column_scale * cho_solve((cholesky, is_lower), column_scale * right_side)
         covariance = scale_of_pair * cho_solve((cholesky, is_lower), identity)
-        # Laplace's approximation of the evidence, which is exact for a linear model
+        # Laplace's approximation of the evidence, which is exact for a linear model:
+        # misfit = |r - X mean|^2 + mean^T P mean
         residual_weights = np.r_[1.0, -mean]
         misfit = float(
             residual_weights @ products @ residual_weights + mean @ (prior_precision * mean)

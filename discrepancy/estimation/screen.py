@@ -342,13 +342,15 @@ def _weigh_effects(
 
 
 def _with_columns(base: Estimate, tried_effects: Sequence[TriedEffect]) -> Linearisation:
-    """Return the trials of an estimate with one more unknown for each effect: its factor."""
-    first_factor = len(base.linearisation.priors)
-    effect = np.concatenate((base.effect, np.zeros(len(tried_effects))))
+    """Return the trials of an estimate with one more unknown for each effect: its amplitude."""
+    first_unknown = len(base.linearisation.priors)
+    effect_values = np.concatenate((base.effect, np.zeros(len(tried_effects))))
     linear_trials = []
     for trial_index, linear_trial in enumerate(base.linearisation.trials):
         columns = [tried_effect.columns[trial_index] for tried_effect in tried_effects]
-        linear_trials.append(_trial_with_columns(linear_trial, columns, first_factor, effect))
+        linear_trials.append(
+            _trial_with_columns(linear_trial, columns, first_unknown, effect_values)
+        )
     priors_of_factors = Priors.without_ranges(_precisions_of_factors(base, tried_effects))
     return Linearisation(
         tuple(linear_trials), base.linearisation.priors.followed_by(priors_of_factors)
@@ -358,13 +360,19 @@ def _with_columns(base: Estimate, tried_effects: Sequence[TriedEffect]) -> Linea
 def _trial_with_columns(
     linear_trial: LinearisedTrial | LinearisedRest,
     columns: Sequence[EffectColumn],
-    first_factor: int,
-    effect: FloatArray,
+    first_unknown: int,
+    effect_values: FloatArray,
 ) -> LinearisedTrial | LinearisedRest:
-    """Return a linear trial with the columns of effects, whose factors are further unknowns.
+    """Add to a linearised trial one unknown for each effect column: its amplitude.
 
-    `first_factor` is the number of the first factor among the unknowns. `effect` are the effect
-    parameters of the estimate, then the factors, which are zero.
+    The amplitude multiplies the forces and the errors of readings of the column.
+
+    Parameters
+    ----------
+    first_unknown : int
+        The index of the first amplitude among all unknowns.
+    effect_values : (E,) array
+        The effect parameters of the estimate, then the amplitudes, which are zero.
     """
     no_force = np.zeros(len(linear_trial.trial.fine_time))
     forces_by_port = {
@@ -372,22 +380,22 @@ def _trial_with_columns(
         for port, force in linear_trial.forces.items()
     }
     errors_by_unknown = dict(linear_trial.sensor_errors.by_unknown)
-    for number, column in enumerate(columns, start=first_factor):
+    for unknown, column in enumerate(columns, start=first_unknown):
         for port, force_of_effect in column.forces.items():
             if port not in forces_by_port:
                 no_law = LawForce(no_force, no_force, no_force)
                 forces_by_port[port] = LinearisedForce(no_law, {})
             force = forces_by_port[port]
             forces_by_port[port] = LinearisedForce(
-                force.law_force, {**force.by_unknown, number: force_of_effect}
+                force.law_force, {**force.by_unknown, unknown: force_of_effect}
             )
         if np.any(column.readings):
-            errors_by_unknown[number] = column.readings
+            errors_by_unknown[unknown] = column.readings
     return replace(
         linear_trial,
         forces=forces_by_port,
         sensor_errors=LinearisedSensorErrors(linear_trial.sensor_errors.change, errors_by_unknown),
-        effect=effect,
+        effect=effect_values,
     )
 
 

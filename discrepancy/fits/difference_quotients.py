@@ -36,17 +36,21 @@ def two_sided_quotient(
 ) -> DifferenceQuotient:
     """Return the derivative of a response with respect to an unknown, from a step to either side.
 
-    It is the central quotient. A one-sided quotient has an error of half the curvature times the
-    step. Such errors can make unknowns look determined that are not: if readings depend only on the
-    ratio of a stiffness to a mass, their derivatives by the logarithms of both are opposite, but
-    the one-sided quotients are not, as if the readings told the mass.
+    For each reading it is
 
-    Some readings jump, such as an acceleration at a reversal of dry friction. If the jump passes a
-    sample within a step, the quotient of that side is about the jump over the step, which is far
-    too large. The derivative is then the quotient of the other side. A reading counts as a jump if
-    the quotients of both sides differ by much compared with the slopes of its channel
-    (`LEAST_JUMP`), and by much more than those of its other readings (`OUTSTANDING_JUMP`): in a
-    smooth but strongly curved response they differ everywhere.
+    - the central quotient, if the reading is smooth;
+    - the smaller of the two one-sided quotients, if the reading jumps within one of the steps.
+
+    A reading jumps if its two one-sided quotients differ by more than `LEAST_JUMP` times the rms
+    slope of its channel, and by more than `OUTSTANDING_JUMP` times the rms difference in its
+    channel. The second condition excludes a smooth but strongly curved response, in which the
+    quotients differ everywhere.
+
+    An example of a jump is an acceleration when dry friction reverses. If the unknown shifts the
+    reversal across a sample, the quotient of that side is the jump divided by the step, which is
+    far too large. Smooth readings need the central quotient, as a one-sided one has an error of
+    half the curvature times the step. Such errors can make a mass look determined where readings
+    depend only on the ratio of a stiffness to it.
 
     Parameters
     ----------
@@ -63,11 +67,13 @@ def two_sided_quotient(
     is_large = difference > LEAST_JUMP * _rms_of_channel(smaller)
     stands_out = difference > OUTSTANDING_JUMP * _rms_of_channel(difference)
     is_jump = is_large & stands_out
-    # the branch beyond the jump, continued from its sample back to the present value of the unknown
-    beyond = np.where(is_forward_smaller, below + smaller * step, above - smaller * step)
+    # A jump in the step below (or, mirrored, above) separates two branches:
+    #     below --jump-- response ---- above
+    # The branch of `below` is continued to the present value of the unknown with the same slope.
+    other_branch = np.where(is_forward_smaller, below + smaller * step, above - smaller * step)
     return DifferenceQuotient(
         slope=np.where(is_jump, smaller, 0.5 * (forward + backward)),
-        jumps=np.where(is_jump, beyond - response, 0.0),
+        jumps=np.where(is_jump, other_branch - response, 0.0),
     )
 
 

@@ -124,7 +124,7 @@ class Screen:
         self._inverse_factor = solve_triangular(
             factor, np.eye(self._nuisance_count), trans="T", check_finite=False
         )
-        self._gradient = self._inverse_factor @ equations.gradient
+        self._whitened_gradient = self._inverse_factor @ equations.gradient  # U^-T g
 
     @property
     def inner_product_signs(self) -> FloatArray:
@@ -169,7 +169,7 @@ class Screen:
         change = self.change_by_effect(term, effect_values).vector
         # H x = g - J d, with the projections U^-T J d at the end of the vector
         projections = change[len(change) - self._nuisance_count :]
-        step = self._inverse_factor.T @ (self._gradient - projections)
+        step = self._inverse_factor.T @ (self._whitened_gradient - projections)
         shared = point.shared + step[: len(point.shared)]
         own_effect = point.effect.copy()
         own_effect[: self._eliminated_count] += step[len(shared) :][: self._eliminated_count]
@@ -218,23 +218,28 @@ class Screen:
         return self.project(standardised_changes)
 
     def project(self, changes: Mapping[int, FloatArray]) -> tuple[FloatArray, float, float]:
-        """Return vector, overlap b and squared length G of changes of the prediction.
+        """Project out of a change of the predictions what refitted nuisances can compensate.
 
-        The part of the changes that refitted nuisances can compensate is projected out.
+        Let d be the change in all trials, r the residuals, J the derivatives of the predictions
+        with respect to the nuisances (one row for each), g the negative gradient of the objective
+        and H = U^T U its Hessian. With q = U^-T J d,
+
+            b = r.d - (U^-T g).q,   G = |d|^2 - |q|^2.
 
         Parameters
         ----------
         changes : mapping of int to (N, C) array
-            The standardised changes of predictions, by the index of the trial.
+            The standardised changes of the predictions of N samples in C channels, by the index of
+            the trial. Trials that are left out do not change.
 
         Returns
         -------
         vector : (D,) array
-            The changes of all trials, then their projections on the nuisances.
+            The change d, then its projection q on the nuisances.
         overlap, squared_length : float
-            b(d) and G(d, d) of the module docstring.
+            b and G.
         """
-        nuisance_overlaps = np.zeros(self._nuisance_count)  # J d, with the change d of all trials
+        nuisance_overlaps = np.zeros(self._nuisance_count)  # J d
         trial_changes = []
         overlap = 0.0
         squared_length = 0.0
@@ -246,8 +251,8 @@ class Screen:
                 overlap += float(trial_rows.residual @ trial_change)
                 squared_length += float(trial_change @ trial_change)
             trial_changes.append(trial_change)
-        projections = self._inverse_factor @ nuisance_overlaps
-        overlap -= float(self._gradient @ projections)
+        projections = self._inverse_factor @ nuisance_overlaps  # q
+        overlap -= float(self._whitened_gradient @ projections)
         squared_length -= float(projections @ projections)
         check_finite(np.array((overlap, squared_length)))
         return np.concatenate((*trial_changes, projections)), overlap, squared_length

@@ -331,7 +331,7 @@ class Comparison(ABC, Generic[HypothesisT]):
             ]
             laws_only: HypothesisT | None = hypothesis
             if 0 < len(law_indices) < len(terms):
-                laws_only = self._fit_subset(hypothesis, law_indices)
+                laws_only = self._hypothesis_with_terms(hypothesis, law_indices)
             if not terms or laws_only is None or laws_only.candidate.key in nameable_with_scores:
                 continue
             if not self.objection_to_naming(laws_only):
@@ -345,21 +345,23 @@ class Comparison(ABC, Generic[HypothesisT]):
             hypothesis for hypothesis, score in nameable_with_scores.values() if score > least_score
         ]
 
-    def _fit_subset(
+    def _hypothesis_with_terms(
         self, hypothesis: HypothesisT, term_indices: Sequence[int]
     ) -> HypothesisT | None:
         """Return the hypothesis that has only some of the effects of a given hypothesis.
 
-        The effects are given by their indices in the candidate. None is returned if they cannot be
-        fitted without the others.
+        The effects are given by their indices in the candidate. The hypothesis is fitted unless it
+        has been before. None is returned if the effects cannot be fitted without the others.
         """
         candidate, effect_values = hypothesis.candidate.subset_of_terms(
             term_indices, hypothesis.effect
         )
-        key = candidate.key
+        # it may be one of the hypotheses that are compared
         compared_hypothesis = self.hypothesis_of(candidate)
         if compared_hypothesis is not None:
             return compared_hypothesis
+        # otherwise it is fitted once and not compared; None marks a fit that failed
+        key = candidate.key
         if key not in self._subsets:
             self._subsets[key] = self.fit_candidate(candidate, effect_values)
         return self._subsets[key]
@@ -375,7 +377,7 @@ class Comparison(ABC, Generic[HypothesisT]):
             options[hypothesis.candidate.key] = hypothesis
         if effect_count > 1:
             for term_index in range(effect_count):
-                single_effect = self._fit_subset(best_hypothesis, [term_index])
+                single_effect = self._hypothesis_with_terms(best_hypothesis, [term_index])
                 if single_effect is not None:
                     options[single_effect.candidate.key] = single_effect
         simpler_options = [
@@ -410,13 +412,17 @@ class Comparison(ABC, Generic[HypothesisT]):
         return not self.objection_to_naming(option)
 
     def probability(self, *hypotheses: HypothesisT) -> float:
-        """Return the probability that at least one of some hypotheses is true.
+        """Return the probability that at least one of the given hypotheses is true.
 
-        A hypothesis is also counted as true if a larger one is, that is one which contains all of
-        its families at their places. Hypotheses that trials refute have no probability.
+        - A ranked hypothesis counts for a given one if it contains all families of the given one at
+          the same places, possibly beside further effects.
+        - A ranked hypothesis that trials refute has no probability. Two kinds are kept in any case:
+          the given ones, whose probability is asked for, and those without effects, which by
+          definition explain nothing of the gap.
         """
         not_refuted = []
         for ranked_hypothesis in self.ranked_hypotheses:
+            # the same object: another fit of the same effects is another hypothesis
             is_asked_about = any(ranked_hypothesis is hypothesis for hypothesis in hypotheses)
             has_effects = bool(ranked_hypothesis.candidate.terms)
             if (
@@ -426,7 +432,7 @@ class Comparison(ABC, Generic[HypothesisT]):
             ):
                 not_refuted.append(ranked_hypothesis)
         scores = np.array([self.score(hypothesis) for hypothesis in not_refuted])
-        # count each hypothesis that contains all families of one of those asked about
+        # a hypothesis counts if it contains all families of one of those asked about
         families_asked_about = [family_place_pairs(hypothesis) for hypothesis in hypotheses]
         is_counted = np.zeros(len(not_refuted), dtype=bool)
         for index, hypothesis in enumerate(not_refuted):

@@ -137,7 +137,11 @@ def _with_test_on_held_out(
 
 
 def _leaves_more_than_noise(verdict: Verdict) -> bool:
-    """Return whether the verdict on noise found a gap that no hypothesis reduces to noise."""
+    """Return whether the verdict on noise found a gap that no hypothesis reduces to noise.
+
+    That is so if the gap is unexplained, or if the test of absolute fit or that on held-out trials
+    failed.
+    """
     failed_tests = {gate.name for gate in verdict.gates if gate.has_failed}
     return verdict.kind is VerdictKind.UNEXPLAINED or bool(
         failed_tests & {"absolute fit", "held-out trials"}
@@ -145,18 +149,22 @@ def _leaves_more_than_noise(verdict: Verdict) -> bool:
 
 
 def _decide_on_coloured_noise(comparison: SimulationComparison) -> VerdictOutcome | None:
-    """Return the verdict if what remains is noise correlated in time as in the noise records.
+    """Return the verdict under coloured noise, or None if it is not conclusive.
 
-    None is returned if more remains than such noise, or if it is open what is missing: the verdict
-    must be that nothing is, that it is too small to be detected, or name one set of effects.
+    It is returned if
+
+    - it says that nothing is missing or that the gap is too small to be detected, or names one set
+      of effects;
+    - the residuals are noise, white or correlated in time as in the noise records;
+    - neither the test of absolute fit nor that on held-out trials fails.
     """
     outcome = decide_on_noise(NoiseCase(comparison, noise=COLOURED))
     outcome = _with_test_on_held_out(comparison, outcome)
     verdict = outcome.verdict
-    remaining = comparison.no_effect if verdict.kind in KINDS_WITHOUT_GAP else outcome.fit
-    process = remaining.residual_process
-    has_recorded_colour = process is not None and process.is_all_recorded_colour
     is_decided = verdict.kind in (*KINDS_WITHOUT_GAP, VerdictKind.NAMED)
+    final_fit = comparison.no_effect if verdict.kind in KINDS_WITHOUT_GAP else outcome.fit
+    process = final_fit.residual_process
+    has_recorded_colour = process is not None and process.is_all_recorded_colour
     if not is_decided or not has_recorded_colour or _leaves_more_than_noise(verdict):
         return None
     return outcome

@@ -194,16 +194,21 @@ class NoiseCase(Generic[HypothesisT]):
         gates: tuple[Gate, ...] = (),
         resembles: tuple[str, ...] = (),
     ) -> VerdictOutcome:
-        """Return a verdict that lists all sets of effects, each at its most probable places.
+        """Return a verdict together with all sets of effects and their probabilities.
+
+        Each set is represented by its most probable hypothesis, that is by the effects at their
+        most probable places.
 
         Parameters
         ----------
         kind, sentence, probability
-            What is concluded, see `Verdict`.
+            The kind of conclusion, the sentence that the user reads, and its probability.
         fit : CandidateFit, optional
-            The fit that represents the verdict; the one without effect if left out.
+            The fit that represents the verdict. Without it, the fit without any effect is taken.
         effects, group, family, gates, resembles
-            Further attributes of the `Verdict`.
+            The named effects; the effects that the data cannot tell apart; the family of a law of
+            free shape; the tests; the effects that an unexplained remainder resembles. See
+            `Verdict`.
         """
         verdict = Verdict(
             kind,
@@ -216,12 +221,12 @@ class NoiseCase(Generic[HypothesisT]):
             gates=gates,
             resembles=resembles,
         )
-        sets = []
+        weighted_hypotheses = []
         for names, set_probability in self.probabilities.items():
             hypothesis = self.comparison.record_values(self.comparison.best_of_set(names))
-            sets.append(WeightedHypothesis(hypothesis, set_probability))
+            weighted_hypotheses.append(WeightedHypothesis(hypothesis, set_probability))
         fit = self.no_effect_fit if fit is None else fit
-        return outcome_with_hypotheses(verdict, self.comparison.search, fit, sets)
+        return outcome_with_hypotheses(verdict, self.comparison.search, fit, weighted_hypotheses)
 
     def unexplained(
         self, sentence: str, probability: float, gates: tuple[Gate, ...], names: EffectSet

@@ -76,11 +76,13 @@ def explained_variance(variable: FloatArray, force: FloatArray) -> float:
 def variance_explained_by_state(trial_forces: Sequence["TrialForce"]) -> float:
     """Return the share of a force's variance that displacement and velocity explain together.
 
-    The force at each sample is predicted by its mean at the nearest states of the port, in all
-    trials. States within half a period of the sample do not count: there the force is similar
-    whatever it depends on (Theiler 1986, Phys. Rev. A 34, 2427-2432). The share is 0 if there are
-    too few samples, or if the motion hardly comes back to a state.
+    The force at each sample is predicted by its mean at the `NEIGHBOURS` nearest states of the port
+    in all trials. States of the same trial within half a period of the sample do not count: there
+    the force is similar whatever it depends on (Theiler 1986, Phys. Rev. A 34, 2427-2432). The
+    share is 0 if there are too few samples, or if less than half of them have enough neighbours
+    among the `CANDIDATE_NEIGHBOURS` nearest states.
     """
+    # N samples of all trials together
     force = np.concatenate([trial.force for trial in trial_forces])
     position = np.concatenate([trial.position for trial in trial_forces])
     speed = np.concatenate([trial.speed for trial in trial_forces])
@@ -96,14 +98,17 @@ def variance_explained_by_state(trial_forces: Sequence["TrialForce"]) -> float:
     scaled_state = np.column_stack(
         [values / max(float(np.std(values)), LEAST_DIVISOR) for values in (position, speed)]
     )
+    # (N, CANDIDATE_NEIGHBOURS): indices of the samples with the nearest states, the nearest first
     _, candidates = KDTree(scaled_state).query(scaled_state, CANDIDATE_NEIGHBOURS)
     is_other_trial = trial_of_sample[candidates] != trial_of_sample[:, np.newaxis]
     distance_in_time = np.abs(candidates - np.arange(sample_count)[:, np.newaxis])
     is_admitted = is_other_trial | (distance_in_time > half_period)
+    # the first NEIGHBOURS admitted candidates: the running count of admitted ones selects them
     is_neighbour = is_admitted & (np.cumsum(is_admitted, axis=1) <= NEIGHBOURS)
-    is_predicted = is_neighbour.sum(axis=1) == NEIGHBOURS
+    is_predicted = is_neighbour.sum(axis=1) == NEIGHBOURS  # (N,)
     if np.count_nonzero(is_predicted) < sample_count / 2:
         return 0.0
+    # (number of predicted samples, NEIGHBOURS)
     neighbours = candidates[is_predicted][is_neighbour[is_predicted]].reshape(-1, NEIGHBOURS)
     errors = force[is_predicted] - force[neighbours].mean(axis=1)
     # the mean of n independent neighbours has an n-th of the variance around the function
@@ -248,34 +253,36 @@ def missing_force(search: ForceSearch, estimate: Estimate) -> MissingForce | Non
     MissingForce or None
         The missing force; None if no force is missing at any port.
     """
-    evidence_of_none = max(
+    log_evidence_without_force = max(
         at_port.log_evidence_without_force for at_port in search.estimate_by_port.values()
     )
-    evidence_by_port = {}
+    log_evidence_ratios = {}  # of a missing force at each port to none
     for name, at_port in search.estimate_by_port.items():
-        evidence_by_port[name] = at_port.log_evidence - evidence_of_none
-    if max(evidence_by_port.values()) < LEAST_EVIDENCE:
+        log_evidence_ratios[name] = at_port.log_evidence - log_evidence_without_force
+    if max(log_evidence_ratios.values()) < LEAST_EVIDENCE:
         return None
     terms = estimate.candidate.terms
     law_ports = {term.port for term in terms if term.port in search.ported.ports}
     if len(law_ports) == 1:
         (port,) = law_ports
     else:
-        port = max(evidence_by_port, key=lambda name: evidence_by_port[name])
-    number = search.ported.ports.index(port)
+        port = max(log_evidence_ratios, key=lambda name: log_evidence_ratios[name])
+    port_index = search.ported.ports.index(port)
     # an estimate without a missing force at this port: take the force at the port alone
-    if number not in estimate.processes:
+    if port_index not in estimate.processes:
         estimate = search.estimate_by_port[port]
     law_name = " and ".join(
         term.name_in_words for term in estimate.candidate.terms if term.port == port
     )
     recorded = {trial.name: trial for trial in search.ported.problem.campaign.trials}
     trial_forces = _with_history_of_motion(
-        _forces_by_trial(estimate, number, recorded, has_law=bool(law_name))
+        _forces_by_trial(estimate, port_index, recorded, has_law=bool(law_name))
     )
     unit, *_ = search.ported.problem.model.port_units(port)
-    correlation_time = estimate.processes[number].correlation_time
-    force = _force_at_port(trial_forces, port, unit, evidence_by_port, correlation_time, law_name)
+    correlation_time = estimate.processes[port_index].correlation_time
+    force = _force_at_port(
+        trial_forces, port, unit, log_evidence_ratios, correlation_time, law_name
+    )
     return MissingForce(force, trial_forces, law_name)
 
 
@@ -285,7 +292,7 @@ def _forces_by_trial(
     """Return the force that the model lacks at a port in each trial, with the motion of the port.
 
     The model lacks the force of the hypothesis' law and the missing force, which no law explains.
-    With `has_law`, the result also has the force of the law by itself. `port` is the number of the
+    With `has_law`, the result also has the force of the law by itself. `port` is the index of the
     port, and `recorded` has the trials as they were recorded, by name.
     """
     trial_forces = []
@@ -331,18 +338,30 @@ def _force_at_port(
     trial_forces: Sequence[TrialForce],
     port: str,
     unit: str,
-    evidence: Mapping[str, float],
+    log_evidence_ratio_by_port: Mapping[str, float],
     correlation_time: float,
     law_name: str,
 ) -> ForceAtPort:
     """Return the record of the missing force at a port for the verdict.
 
-    `evidence` is the log evidence of a missing force over none, by the name of the port [nat].
+    Parameters
+    ----------
+    trial_forces : sequence of TrialForce
+        The force and the motion of the port in each trial.
+    unit : str
+        The unit of the force.
+    log_evidence_ratio_by_port : mapping of str to float
+        The log evidence of a missing force at a port, minus that of no missing force [nat].
+    correlation_time : float
+        The correlation time of the missing force [s].
+    law_name : str
+        The effects with a law at the port, in words; empty if there is none.
     """
     force = np.concatenate([trial_force.force for trial_force in trial_forces])
     position = np.concatenate([trial_force.position for trial_force in trial_forces])
     speed = np.concatenate([trial_force.speed for trial_force in trial_forces])
-    shares, ordered_by = _explanatory_variables_of_trials(trial_forces)
+    # the share of the variance that each variable explains, and the variables that explain most
+    shares, explanatory_names = _explanatory_variables_of_trials(trial_forces)
     # the trial and the sample with the largest force
     trial = max(trial_forces, key=lambda trial_force: float(np.abs(trial_force.force).max()))
     sample_of_largest = int(np.abs(trial.force).argmax())
@@ -360,10 +379,10 @@ def _force_at_port(
         displacement=_rms(position),
         speed=_rms(speed),
         largest=largest,
-        evidence=evidence,
+        evidence=log_evidence_ratio_by_port,
         correlation_time=correlation_time,
         orders=shares,
-        ordered_by=ordered_by,
+        ordered_by=explanatory_names,
         law=law_name,
     )
 

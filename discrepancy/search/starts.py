@@ -259,13 +259,13 @@ def start_with_added_effect(base: CandidateFit, term: EffectTerm, values: FloatA
 def grid_starts(problem: Problem, base: CandidateFit, effect: Effect) -> list[FitStart]:
     """Return the points of a parameter grid at which a fit of one more effect should begin.
 
-    They are the points with the least objective, at most `SEARCH.starts_far_from_data`. A grid
-    needs a simulation for each point. It is used where the residuals are so large that a screen,
-    which is linear, is not reliable.
+    A grid needs a simulation for each point. It is used where the residuals are so large that a
+    screen, which is linear, is not reliable. The starts, best first, are
 
-    If the effect changes mass or stiffness at one of many places, the grid covers only the best few
-    places (see `_best_places`), and the best point of each of them is returned. Where errors of a
-    mesh are fitted, this is the point that a fit to the first periods gives.
+    - the best point at each of the best few places (see `_best_places`), if the effect changes
+      mass or stiffness at one of more than `SEARCH.few_places` places;
+    - otherwise the points with the least objective among all places, at most
+      `SEARCH.starts_far_from_data`.
 
     Parameters
     ----------
@@ -275,25 +275,41 @@ def grid_starts(problem: Problem, base: CandidateFit, effect: Effect) -> list[Fi
         The effect; all its places are tried where the base does not have it.
     """
     places = free_places(effect, base.candidate, problem.setting)
+    # a parameter with a single level has the same value at all points
     varied_count = sum(parameter.levels != 1 for parameter in effect.parameters)
     level_counts = SEARCH.grid_levels_far_from_data
     level_count = level_counts[min(varied_count, len(level_counts) - 1)]
     # medians of intervals of equal prior probability
     levels = ndtri((np.arange(level_count) + 0.5) / max(level_count, 1))
-    is_chosen_by_place = len(places) > SEARCH.few_places and moves_frequencies(
-        effect, problem.setting
-    )
-    if is_chosen_by_place:
-        best_places = _best_places(problem, base, effect, places, levels)
-        if problem.model.nuisance_parameters:
-            return [point.start for point in best_places]
-        places = tuple(point.place for point in best_places)
+    if len(places) > SEARCH.few_places and moves_frequencies(effect, problem.setting):
+        return _starts_at_best_places(problem, base, effect, places, levels)
     points = _grid_points(problem, base, _refitting_screen(problem, base), effect, places, levels)
-    if is_chosen_by_place:
-        best_of_places = {point.place: point for point in reversed(points)}
-        points = sorted(best_of_places.values(), key=lambda point: point.objective)
-        return [point.start for point in points]
     return [point.start for point in points[: SEARCH.starts_far_from_data]]
+
+
+def _starts_at_best_places(
+    problem: Problem,
+    base: CandidateFit,
+    effect: Effect,
+    places: Sequence[str],
+    levels: FloatArray,
+) -> list[FitStart]:
+    """Return the best start at each of the best places, the best first.
+
+    If the model has nuisance parameters, such as errors of a mesh, these are the points of fits to
+    the first periods. Otherwise the levels (L,) are searched again with the whole records.
+    """
+    best_places = _best_places(problem, base, effect, places, levels)
+    if problem.model.nuisance_parameters:
+        return [point.start for point in best_places]
+    best_place_names = [point.place for point in best_places]
+    points = _grid_points(
+        problem, base, _refitting_screen(problem, base), effect, best_place_names, levels
+    )
+    # points come with rising objective: in reversed order, the best of a place is entered last
+    best_point_by_place = {point.place: point for point in reversed(points)}
+    best_points = sorted(best_point_by_place.values(), key=lambda point: point.objective)
+    return [point.start for point in best_points]
 
 
 def _best_places(

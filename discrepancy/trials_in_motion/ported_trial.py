@@ -41,8 +41,14 @@ def correlated_noise_part(
 ) -> ColouredNoise | None:
     """Return the part of a channel's noise that is correlated in time, or None if it is white.
 
-    The noise is taken as the sum of white noise and an autoregression of first order. The
-    autocovariances of the sum at lags of 0, 1 and 2 samples determine both.
+    The noise is taken as the sum of white noise and an autoregression of first order. Let c_k be
+    the autocovariance at a lag of k samples, `share` the fraction of the variance c_0 that is
+    correlated, and `decay` the correlation of its successive samples. Then
+
+        c_1 = share c_0 decay,   c_2 = c_1 decay.
+
+    The noise counts as white if no such sum has its autocovariances, or if its autoregression was
+    fitted at another sampling interval.
 
     Parameters
     ----------
@@ -58,15 +64,14 @@ def correlated_noise_part(
     impulse_response = lfilter(
         [1.0], np.r_[1.0, -noise.autoregression], np.r_[1.0, np.zeros(LONGEST_CORRELATION)]
     )
-    # up to a common factor, the autocovariances at lags of 0, 1 and 2 samples
+    # c_0, c_1 and c_2 up to a common factor, from the response of the autoregression to an impulse
     autocovariances = [
         float(impulse_response[: len(impulse_response) - lag] @ impulse_response[lag:])
         for lag in range(3)
     ]
+    # the decay must be between 0 and 1
     if not 0.0 < autocovariances[2] < autocovariances[1]:
         return None
-    # c_1 = share c_0 decay and c_2 = c_1 decay, where `share` is the fraction of the variance c_0
-    # that is correlated, and `decay` the correlation of its successive samples
     decay = autocovariances[2] / autocovariances[1]
     share = autocovariances[1] / decay / autocovariances[0]
     return ColouredNoise(

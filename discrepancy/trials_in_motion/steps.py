@@ -181,31 +181,38 @@ def multiply(left_matrix: FloatArray, right_matrix: FloatArray, product: FloatAr
 
 @callable_when_compiled
 def weight_moved_to_end(
-    begin: FloatArray, end: FloatArray, tangent_at_begin: FloatArray, tangent_at_end: FloatArray
+    response_at_begin: FloatArray,
+    response_at_end: FloatArray,
+    tangent_at_begin: FloatArray,
+    tangent_at_end: FloatArray,
 ) -> float:
-    """Return the fraction of a force's weight at the start of a substep that moves to its end.
+    """Return the fraction w of a force's weight at the start of a substep that moves to its end.
 
-    Let s be the stiffness of a law over the substep: the decrease of its force by the motion that
-    a unit of the force causes. An error e of the force becomes
-    e (1 - (1 - theta) s) / (1 + theta s) in the theta scheme, which keeps the sign of e if theta is
-    at least 1 - 1 / s. The weights at start and end are equal at first, theta = 1/2. If a fraction
-    w of the weight at the start moves to the end, theta is (1 + w) / 2, so that w must be 1 - 2 / s
-    for s > 2, and zero below.
+    This prevents errors of stiff laws that alternate in sign from substep to substep. Let a unit
+    force over the whole substep move its port such that the force of the law there changes by -s,
+    with the dimensionless stiffness s > 0. In the theta scheme an error e of the force becomes
+
+        e (1 - (1 - theta) s) / (1 + theta s),
+
+    which has the sign of e if theta >= 1 - 1 / s. Equal weights at start and end are theta = 1/2.
+    With a fraction w moved, theta = (1 + w) / 2. Hence w = 1 - 2 / s if s > 2, and 0 otherwise.
 
     Parameters
     ----------
-    begin, end : (n, P) ndarray
-        The change of the state by a unit force at the start and at the end of the substep.
+    response_at_begin, response_at_end : (n, P) ndarray
+        The change of the n states due to a unit force at each of P ports, at the start and at the
+        end of the substep.
     tangent_at_begin, tangent_at_end : (P, n) ndarray
-        The derivative of the laws' force at a port by the state, at both ends.
+        The derivatives of the laws' forces at the ports with respect to the states, evaluated at
+        the start and at the end of the substep.
     """
-    # -s of a port: its tangent times the changes of the state by a unit force at both ends, since
-    # the force acts at both. The tangents at both ends are tried, and the stiffest port decides.
+    # s = -tangent . (response to a unit force at the start + at the end). The tangent may be that
+    # of either end: the larger s counts, and that of the stiffest port.
     largest_stiffness = 0.0
     for p in range(len(tangent_at_begin)):
         stiffness_at_begin, stiffness_at_end = 0.0, 0.0
-        for i in range(len(begin)):
-            change = begin[i, p] + end[i, p]
+        for i in range(len(response_at_begin)):
+            change = response_at_begin[i, p] + response_at_end[i, p]
             stiffness_at_begin -= tangent_at_begin[p, i] * change
             stiffness_at_end -= tangent_at_end[p, i] * change
         largest_stiffness = max(largest_stiffness, stiffness_at_begin, stiffness_at_end)

@@ -382,7 +382,9 @@ class PortedTrial:
     def readings_of_state(
         self, states: FloatArray, forces: Mapping[int, FloatArray] = NO_FORCES
     ) -> FloatArray:
-        """Return the readings (N, C) by an added state and forces, divided by the noise.
+        """Return the whitened readings (N, C) caused by an added state and forces.
+
+        They are divided by the standard deviation of the noise.
 
         Parameters
         ----------
@@ -396,7 +398,7 @@ class PortedTrial:
     def outputs_of_state(
         self, system: PortedSystem, states: FloatArray, forces: Mapping[int, FloatArray]
     ) -> FloatArray:
-        """Return the outputs (N, C) of a system by an added state and forces [unit of the channel].
+        """Return the outputs (N, C) that an added state and forces cause, in units of the channels.
 
         Parameters
         ----------
@@ -421,20 +423,29 @@ class PortedTrial:
     def readings_of_forces_in_block(
         self, forces: Mapping[int, FloatArray], begin: int, end: int
     ) -> FloatArray:
-        """Return the readings (B, C) by forces in a block of B samples, divided by the noise.
+        """Return the whitened readings that forces cause in a block of samples.
 
         The system is at rest at the start of the block, so that forces before it have no effect.
 
         Parameters
         ----------
         forces : mapping of int to (F,) array
-            The forces at ports at all fine stamps, by the number of the port.
+            The forces at ports, by the index of the port, at the F fine stamps of the whole trial
+            [N, N m or the port's flow].
         begin, end : int
             The first sample of the block, and the one after its last.
+
+        Returns
+        -------
+        (B, C) array
+            The readings of C channels at the B samples, over the standard deviation of the noise;
+            0 where a reading does not count.
         """
         fine_stamps_of_block = slice(begin * self.substeps, (end - 1) * self.substeps + 1)
         forces_in_block = {port: force[fine_stamps_of_block] for port, force in forces.items()}
+        # s' = A s - sum_p b_p g_p (see `PortedSystem`): hence the minus sign
         directions = -np.array([self.system.actions[port] for port in forces_in_block]).T
+        # the index of the length of the interval that ends at each sample
         step_of_sample = np.ascontiguousarray(self.intervals.length_of_sample[begin:end])
         inputs = np.array([*forces_in_block.values()]).T
         states = self._state_under_inputs(
