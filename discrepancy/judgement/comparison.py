@@ -1,10 +1,10 @@
 """Comparison of the hypotheses of a search: evidence, explained share of the gap, objections.
 
 Hypotheses on a model with ports are estimated with the force that they leave missing, but for
-missions. Others are compared by simulations, under the recorded noise or under a noise as large as
-their residuals. In both cases each hypothesis has evidence, and explains a share of the *gap*
-between the model and the readings, in fitted and in held-out trials. `decide` draws the verdict
-from them.
+missions and load steps on a mesh. Others are compared by simulations, under the recorded noise or
+under a noise as large as their residuals. In both cases each hypothesis has evidence, and explains
+a share of the *gap* between the model and the readings, in fitted and in held-out trials. `decide`
+draws the verdict from them.
 """
 
 from abc import ABC, abstractmethod
