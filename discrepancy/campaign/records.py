@@ -302,12 +302,12 @@ class Campaign:
     def accepted_faults(self, channel: str = "", trial: str = "") -> frozenset[str]:
         """Return the faults of data that the campaign accepts in a channel of a trial.
 
-        Faults are accepted by the keys `accept` of the campaign, of the channel and of the trial.
+        They are the union of the lists `accept` of the campaign, of the channel and of the trial.
 
         Parameters
         ----------
         channel, trial : str
-            Names of the channel and the trial; with an empty name its key does not count.
+            The names of the channel and the trial; an empty name leaves its list out.
         """
         faults = set(self.accept)
         if channel in self.channels:

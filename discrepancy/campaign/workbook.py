@@ -31,6 +31,9 @@ class WorkbookSheet(NamedTuple):
 def read_workbook(path: Path) -> dict[str, WorkbookSheet]:
     """Return the sheets of a workbook by title.
 
+    Rows whose cells are all empty are left out. `blank_cells` are cells that the file stores
+    without any value, which may be formulas that were never computed.
+
     Raises
     ------
     CampaignFileError
@@ -46,7 +49,8 @@ def read_workbook(path: Path) -> dict[str, WorkbookSheet]:
     try:
         with warnings.catch_warnings(action="ignore"):
             book = load_workbook(io.BytesIO(path.read_bytes()), read_only=True, data_only=True)
-            # cells of times keep their numbers of days, which openpyxl rounds to milliseconds
+            # Without formats of dates, openpyxl returns times as serial day numbers. Its own
+            # conversion rounds them to milliseconds.
             book._date_formats = frozenset()
             for sheet in book.worksheets:
                 sheet.reset_dimensions()  # those in the file may be wrong
@@ -123,7 +127,7 @@ def refuse_formulas_among(blank_cells: Set[str], path: Path, title: str) -> None
     """
     from openpyxl import load_workbook
 
-    formulas = []  # read again, since `data_only` returns values in the place of formulas
+    formulas = []  # the file is read again: `data_only` returned values instead of formulas
     with warnings.catch_warnings(action="ignore"):
         book = load_workbook(io.BytesIO(path.read_bytes()), read_only=True)
         book[title].reset_dimensions()

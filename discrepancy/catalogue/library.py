@@ -234,8 +234,8 @@ def check_effects(effects: Iterable[Effect]) -> None:
     effects = tuple(effects)
     counts = Counter(effect.identifier for effect in effects)
     for effect in effects:
-        for fault in _effect_faults(effect):
-            raise CatalogueError(f"The effect {effect.identifier!r}{fault}")
+        for message in _faults_of_effect(effect):
+            raise CatalogueError(message)
     for identifier, count in counts.items():
         if count > 1:
             raise CatalogueError(
@@ -250,31 +250,44 @@ def check_effects(effects: Iterable[Effect]) -> None:
                 )
 
 
-def _effect_faults(effect: Effect) -> Iterator[str]:
-    """Yield the faults of an effect, each as the end of the sentence "The effect 'NAME' ..."."""
+def _faults_of_effect(effect: Effect) -> Iterator[str]:
+    """Yield a message for each fault of an effect."""
+    subject = f"The effect {effect.identifier!r}"
     if not (effect.name and _IDENTIFIER.fullmatch(str(effect.identifier))):
-        yield " must have a name, and an identifier of lower-case letters, digits and underscores."
+        yield (
+            f"{subject} must have a name, and an identifier of lower-case letters, digits and "
+            "underscores."
+        )
     if not effect.acts_on:
-        yield " does not say which trials it acts on."
+        yield f"{subject} does not say which trials it acts on."
     if not effect.parameters:
-        yield " has no parameters."
+        yield f"{subject} has no parameters."
     parameters: tuple[EffectParameter | ShapeParameter, ...] = (*effect.parameters, *effect.shape)
     for name, count in Counter(parameter.name for parameter in parameters).items():
         if count > 1:
-            yield f" has {count} parameters with the name {name!r}."
+            yield f"{subject} has {count} parameters with the name {name!r}."
     if effect.relative_frequency is not None and effect.relative_frequency <= 0.0:
-        yield f" must have a positive relative_frequency, but has {effect.relative_frequency:g}."
+        yield (
+            f"{subject} must have a positive relative_frequency, but has "
+            f"{effect.relative_frequency:g}."
+        )
     for parameter in parameters:
         prior = parameter.prior
-        place = f", parameter {parameter.name!r}: "
+        subject_of_parameter = f"{subject}, parameter {parameter.name!r}"
         if not prior.low < prior.high:
-            yield f"{place}the prior must have low < high, but has {prior.low:g}, {prior.high:g}."
-        if prior.shape == "log_normal" and prior.low <= 0.0:
-            yield f"{place}a log-normal prior must have low > 0, but has {prior.low:g}."
-    for shape in effect.shape:
-        prior = shape.prior
-        if not prior.low < shape.canonical < prior.high:
             yield (
-                f": the canonical value {shape.canonical:g} of {shape.name!r} must lie between "
-                f"{prior.low:g} and {prior.high:g}."
+                f"{subject_of_parameter}: the prior must have low < high, but has {prior.low:g}, "
+                f"{prior.high:g}."
+            )
+        if prior.shape == "log_normal" and prior.low <= 0.0:
+            yield (
+                f"{subject_of_parameter}: a log-normal prior must have low > 0, but has "
+                f"{prior.low:g}."
+            )
+    for shape_parameter in effect.shape:
+        prior = shape_parameter.prior
+        if not prior.low < shape_parameter.canonical < prior.high:
+            yield (
+                f"{subject}: the canonical value {shape_parameter.canonical:g} of "
+                f"{shape_parameter.name!r} must lie between {prior.low:g} and {prior.high:g}."
             )

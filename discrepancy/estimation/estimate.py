@@ -43,7 +43,7 @@ class Estimate:
     conditional_covariance : (K + E, K + E) ndarray
         The covariance of shared unknowns and effect parameters, given the missing force's process.
     processes : mapping of int to Process
-        The forces that remain missing with the effects, by the numbers of their ports.
+        The forces that remain missing with the effects, by the index of the port.
     log_evidence : float
         The log evidence, with the prior of the processes [nat].
     trials : tuple of SmoothedTrial

@@ -80,7 +80,7 @@ class MotionEstimator:
     gauss_newton : GaussNewton
         The iteration under given missing forces.
     processes_without_effects : mapping of int to Process
-        The missing forces without any effect, by the number of the port.
+        The missing forces without any effect, by the index of the port.
     """
 
     gauss_newton: GaussNewton
@@ -148,7 +148,7 @@ class MotionEstimator:
         start : EstimatorStart
             The values and trajectories to begin with, and large missing forces.
         small_processes : mapping of int to Process
-            The small missing forces, by the number of the port.
+            The small missing forces, by the index of the port.
 
         Returns
         -------

@@ -30,7 +30,7 @@ class FilteredTrial:
     linear_trial : LinearisedTrial
         The trial, linear along a trajectory.
     processes : mapping of int to Process
-        The missing forces, by the number of the port.
+        The missing forces, by the index of the port.
     """
 
     linear_trial: LinearisedTrial
@@ -138,9 +138,10 @@ class FilteredTrial:
     def whitened_products(self) -> tuple[FloatArray, float]:
         """The inner products (W, W) of the whitened columns, and half a log determinant [nat].
 
-        The columns are the residual and its derivatives by the unknowns. The determinant is that of
-        the covariance of the readings: the product of the variances of their innovations. It is
-        infinite if a missing force is so large that the readings are lost in rounding errors.
+        The columns are the residual and its derivatives with respect to the unknowns. The
+        determinant is that of the covariance of the readings: the product of the variances of their
+        innovations. It is infinite if a missing force is so large that the readings are lost in
+        rounding errors.
         """
         linear_trial = self.linear_trial
         trial = linear_trial.trial
@@ -283,7 +284,7 @@ class SmoothedTrial:
     trajectory : Trajectory
         The smoothed motion, and all forces at ports.
     missing_forces : mapping of int to (F,) ndarray
-        The missing force at each port, which no law explains, by the number of the port [N, N m or
+        The missing force at each port, which no law explains, by the index of the port [N, N m or
         the port's flow].
     missing_force_deviations : mapping of int to (F,) ndarray
         The posterior standard deviation of `missing_forces`.

@@ -269,7 +269,7 @@ class ForceSearch:
         )
 
     def estimate_effects(
-        self, base: Estimate, candidate: Candidate, effect: FloatArray
+        self, base: Estimate, candidate: Candidate, effect_values: FloatArray
     ) -> Estimate | None:
         """Return a set of effects at its most probable values, estimated with the motion.
 
@@ -283,7 +283,7 @@ class ForceSearch:
         ----------
         base : Estimate
             The estimate whose unknowns, motion and missing forces are those to begin with.
-        effect : (E,) array
+        effect_values : (E,) array
             The scaled effect parameters to begin with.
 
         Returns
@@ -292,7 +292,7 @@ class ForceSearch:
             The estimate; None if the laws are not possible along the motion.
         """
         trials = base.ported_trials
-        start = replace(start_from_estimate(base), effect=effect)
+        start = replace(start_from_estimate(base), effect=effect_values)
         processes = {
             port: replace(
                 process,
@@ -373,7 +373,7 @@ class ForceSearch:
             self.estimate_without_effects = _best((estimate, self.estimate_without_effects))
 
     def estimate_roughly(
-        self, base: Estimate, candidate: Candidate, effect: FloatArray, processes: Processes
+        self, base: Estimate, candidate: Candidate, effect_values: FloatArray, processes: Processes
     ) -> Estimate | None:
         """Return a set of effects near its most probable values, for a first comparison.
 
@@ -384,7 +384,7 @@ class ForceSearch:
         ----------
         base : Estimate
             The estimate without the last of the effects.
-        effect : (E,) array
+        effect_values : (E,) array
             The scaled effect parameters to begin with.
         processes : mapping of int to Process
             The missing forces that may remain beside the effects.
@@ -395,12 +395,12 @@ class ForceSearch:
             The estimate; None if the laws are not possible along the motion.
         """
         trials = base.ported_trials
-        start = replace(start_from_estimate(base), effect=effect)
+        start = replace(start_from_estimate(base), effect=effect_values)
         laws = self.ported.laws(candidate, trials)
         return self.estimator(trials).estimate_roughly(laws, start, processes)
 
     def polish_effects(
-        self, base: Estimate, candidate: Candidate, effect: FloatArray
+        self, base: Estimate, candidate: Candidate, effect_values: FloatArray
     ) -> Estimate | None:
         """Return a set of effects at its most probable values, from values that are near these.
 
@@ -408,7 +408,7 @@ class ForceSearch:
         ----------
         base : Estimate
             The estimate whose motion and missing forces are those to begin with.
-        effect : (E,) array
+        effect_values : (E,) array
             The scaled effect parameters to begin with.
 
         Returns
@@ -417,7 +417,7 @@ class ForceSearch:
             The estimate; None if the laws are not possible along the motion.
         """
         trials = base.ported_trials
-        start = replace(start_from_estimate(base), effect=effect)
+        start = replace(start_from_estimate(base), effect=effect_values)
         # the estimate without effects has no window
         speed_window = base.speed_window or USUAL_WINDOW
         return self.estimator(trials).polish(
@@ -433,18 +433,18 @@ class ForceSearch:
         hardly change, at most `MOST_LINEARISATIONS` times. The last estimate that could be made is
         returned.
         """
-        for number in range(MOST_LINEARISATIONS):
+        for iteration in range(MOST_LINEARISATIONS):
             trials = estimate.ported_trials
             point = self.ported.point_of(estimate)
             point_of_trials = trials[0].linearisation_point[: len(point.shared)]
             is_same_point = bool(np.all(np.abs(point.shared - point_of_trials) < SAME_POINT))
-            if is_same_point and number > 0:
+            if is_same_point and iteration > 0:
                 break
             next_trials = trials if is_same_point else self.ported.trial_set.trials_about(point)
             laws = self.ported.laws(estimate.candidate, next_trials)
             estimator = self.estimator(next_trials)
             start = start_in_other_trials(estimate, next_trials)
-            if number == 0 and not estimate.follows_laws:
+            if iteration == 0 and not estimate.follows_laws:
                 next_estimate = estimator.estimate_nearby(laws, start, estimate.speed_window)
             else:
                 next_estimate = estimator.polish(

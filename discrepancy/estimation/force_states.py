@@ -93,7 +93,7 @@ class ForceStates:
     trial : PortedTrial
         The trial as a linear system with ports.
     processes : sequence of (int, Process)
-        The missing forces, each with the number of its port. Several may act at one port.
+        The missing forces, each with the index of its port. Several may act at one port.
     """
 
     trial: PortedTrial

@@ -72,7 +72,7 @@ class HypothesisLaws(Protocol):
         Returns
         -------
         (mapping of int to LinearisedForce, LinearisedSensorErrors) or None
-            The forces by the number of the port, and the changes of the readings; None if an effect
+            The forces by the index of the port, and the changes of the readings; None if an effect
             is not possible at these values.
         """
 
@@ -87,7 +87,7 @@ class HypothesisLaws(Protocol):
         Returns
         -------
         mapping of int to LawForce or None
-            The forces by the number of the port; None if an effect is not possible at these values.
+            The forces by the index of the port; None if an effect is not possible at these values.
         """
 
     def motion_under_laws(
@@ -312,7 +312,7 @@ class GaussNewton:
     shared_priors : Priors
         The priors of the K shared unknowns.
     prior_medians : mapping of int to Process
-        The prior medians of the missing forces, by the number of the port.
+        The prior medians of the missing forces, by the index of the port.
     """
 
     trials: tuple[LinearTrial, ...]

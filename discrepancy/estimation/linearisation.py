@@ -113,7 +113,7 @@ class Linearisation:
         Parameters
         ----------
         processes : mapping of int to Process
-            The missing forces, by the number of the port.
+            The missing forces, by the index of the port.
         solution : Solution
             The values of the shared unknowns and of those of effects. The local unknowns are the
             most probable ones beside these.
@@ -126,9 +126,9 @@ class Linearisation:
         Parameters
         ----------
         median_processes : mapping of int to Process
-            The prior medians of the missing forces, by the number of the port.
+            The prior medians of the missing forces, by the index of the port.
         processes : mapping of int to Process
-            The missing forces as random processes, by the numbers of their ports.
+            The missing forces as random processes, by the index of the port.
         """
         return self.solve(processes).log_evidence + prior_log_density(median_processes, processes)
 
@@ -146,7 +146,7 @@ class Linearisation:
         Parameters
         ----------
         median_processes : mapping of int to Process
-            The prior medians of the missing forces, by the number of the port.
+            The prior medians of the missing forces, by the index of the port.
         initial_processes : mapping of int to Process
             The missing forces to begin with.
         skip_grid : bool
@@ -172,7 +172,7 @@ def _most_probable_local_unknowns(
     Local unknowns occur in one trial only, such as its initial state. The K + E other unknowns are
     fixed at given values.
     """
-    # inner products of the whitened residual (index 0) and its derivatives by the unknowns
+    # inner products of the whitened residual (index 0) and its derivatives with respect to unknowns
     products, _ = filtered_trial.whitened_products
     first_local = 1 + len(shared_and_effect)
     local_slice = slice(first_local, None)

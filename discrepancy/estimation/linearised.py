@@ -64,9 +64,9 @@ class LinearisedTrial:
     trajectory : Trajectory
         The trajectory along which it is linear.
     forces : mapping of int to LinearisedForce
-        The forces of all laws, by the number of the port.
+        The forces of all laws, by the index of the port.
     sensor_errors : LinearisedSensorErrors
-        The changes of readings by the hypothesis' effects of sensors.
+        The changes of readings caused by the errors of sensors in the hypothesis.
     effect : (E,) ndarray
         The values of the effects' unknowns at which laws and sensors are linearised.
     shared : (K,) ndarray
@@ -174,7 +174,7 @@ class LinearisedTrial:
 
     @cached_property
     def state_rate_by_force(self) -> FloatArray:
-        """The rate (n, L) of the structure's state by a unit force at each port with a law."""
+        """The rate (n, L) of the structure's state under a unit force at each port with a law."""
         # a force acts against the motion: s' = A s - b force, see `PortedSystem`
         actions = self.trial.system.actions[list(self.law_ports)]
         return np.ascontiguousarray(-actions.T)
@@ -247,7 +247,7 @@ class LinearisedTrial:
 
     @cached_property
     def rate_matrix_at_start(self) -> FloatArray:
-        """The rate (n, n) of the state by the state at the first sample, laws included [1/s]."""
+        """The matrix (n, n) from the state to its rate at the first sample, laws included [1/s]."""
         return np.asarray(
             self.trial.system.generator + self.state_rate_by_force @ self.force_by_state[0]
         )

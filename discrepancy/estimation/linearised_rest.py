@@ -48,9 +48,9 @@ class LinearisedRest:
     trajectory : Trajectory
         The positions of the ports, and the forces there, about which it is linear.
     forces : mapping of int to LinearisedForce
-        The forces of all laws, by the number of the port.
+        The forces of all laws, by the index of the port.
     sensor_errors : LinearisedSensorErrors
-        The changes of readings by the hypothesis' effects of sensors.
+        The changes of readings caused by the errors of sensors in the hypothesis.
     effect, shared : (E,), (K,) ndarray
         The values of the unknowns of effects, and of the shared ones, about which it is linear.
     simulation : Simulation or None
@@ -100,20 +100,20 @@ class LinearisedRest:
 
     @cached_property
     def positions_by_weight(self) -> FloatArray:
-        """The positions (N, P, W) by the model alone; derivatives by unknowns at the forces there.
+        """The positions of the P ports caused by the model alone, per unit of each of W weights.
 
-        An unknown changes the positions by the loads and, as it changes the compliance, by the
-        forces.
+        An (N, P, W) array for N load steps. An unknown changes the positions under the loads and,
+        as it changes the compliance, those under the forces of the trajectory.
         """
         trial = self.trial
         positions = np.zeros((*trial.response.positions.shape, self.weight_count))
         positions[:, :, CONSTANT] = trial.response.positions
-        for number, derivative in trial.response_derivatives.items():
+        for unknown_index, derivative in trial.response_derivatives.items():
             change = derivative.positions + trial.added_positions(
                 derivative, self.trajectory.forces
             )
-            positions[:, :, self.weight_index(number)] += change
-            positions[:, :, CONSTANT] -= trial.linearisation_point[number] * change
+            positions[:, :, self.weight_index(unknown_index)] += change
+            positions[:, :, CONSTANT] -= trial.linearisation_point[unknown_index] * change
         return positions
 
     @cached_property
@@ -126,9 +126,9 @@ class LinearisedRest:
             forces[:, port, CONSTANT] += (
                 law.force - law.by_position * self.trajectory.positions[:, port]
             )
-            for number, derivative in force.by_unknown.items():
-                forces[:, port, 1 + number] += derivative
-                forces[:, port, CONSTANT] -= unknowns[number] * derivative
+            for unknown_index, derivative in force.by_unknown.items():
+                forces[:, port, 1 + unknown_index] += derivative
+                forces[:, port, CONSTANT] -= unknowns[unknown_index] * derivative
         return np.asarray(self.force_by_own_force @ forces)
 
     @cached_property
@@ -136,25 +136,25 @@ class LinearisedRest:
         """The residuals (N, C, W) without missing forces, for a unit of each weight.
 
         First the readings minus their prediction at zero unknowns, then minus the derivatives of
-        the prediction by the unknowns. All are divided by the noise, and zero for a reading that
-        does not count.
+        the prediction with respect to the unknowns. All are divided by the standard deviation of
+        the noise, and zero for a reading that does not count.
         """
         trial = self.trial
         columns = np.zeros((*trial.residual.shape, self.weight_count))
         columns[:, :, CONSTANT] = trial.residual - self.sensor_errors.change
         # errors of sensors change the readings by c0 + d (u - u0), which lowers the residual
         unknowns = np.concatenate((self.shared, self.effect))
-        for number, derivative in self.sensor_errors.by_unknown.items():
-            columns[:, :, 1 + number] -= derivative
-            columns[:, :, CONSTANT] += unknowns[number] * derivative
+        for unknown_index, derivative in self.sensor_errors.by_unknown.items():
+            columns[:, :, 1 + unknown_index] -= derivative
+            columns[:, :, CONSTANT] += unknowns[unknown_index] * derivative
         # the response of the model is linear about zero unknowns already
         derivatives = np.concatenate((trial.shared_derivatives, trial.local_derivatives))
-        for number, derivative in enumerate(derivatives):
-            columns[:, :, self.weight_index(number)] -= derivative
+        for unknown_index, derivative in enumerate(derivatives):
+            columns[:, :, self.weight_index(unknown_index)] -= derivative
         # parameters and gains change the readings of given forces
-        for number, derivative in self._readings_by_unknowns().items():
-            columns[:, :, self.weight_index(number)] -= derivative
-            columns[:, :, CONSTANT] += trial.linearisation_point[number] * derivative
+        for unknown_index, derivative in self._readings_by_unknowns().items():
+            columns[:, :, self.weight_index(unknown_index)] -= derivative
+            columns[:, :, CONSTANT] += trial.linearisation_point[unknown_index] * derivative
         columns += np.einsum("npc,npw->ncw", trial.response.outputs_by_force, self.force_by_weight)
         if self.simulation is not None:
             # at the values of the simulation, the residual is that of the simulation
@@ -163,16 +163,19 @@ class LinearisedRest:
         return columns * trial.used[:, :, None]
 
     def _readings_by_unknowns(self) -> dict[int, FloatArray]:
-        """Return the derivatives (N, C) of the readings of the forces, by parameters and gains."""
+        """Return the derivatives (N, C) of the readings caused by forces, by index of the unknown.
+
+        The unknowns are the parameters and the gains.
+        """
         trial = self.trial
         forces = self.trajectory.forces
         derivatives = {
-            number: trial.readings_of_forces(derivative, forces)
-            for number, derivative in trial.response_derivatives.items()
+            unknown_index: trial.readings_of_forces(derivative, forces)
+            for unknown_index, derivative in trial.response_derivatives.items()
         }
         readings = trial.readings_of_forces(trial.response, forces)
-        for number, channel, scale in trial.gain_unknowns:
-            derivatives[number] = readings * scale * np.eye(readings.shape[1])[channel]
+        for unknown_index, channel, scale in trial.gain_unknowns:
+            derivatives[unknown_index] = readings * scale * np.eye(readings.shape[1])[channel]
         return derivatives
 
 
@@ -185,7 +188,7 @@ class RestUnderForces:
     linear_trial : LinearisedRest
         The trial, linear along its positions.
     processes : mapping of int to Process
-        The missing forces, by the number of the port.
+        The missing forces, by the index of the port.
     """
 
     linear_trial: LinearisedRest
@@ -216,8 +219,8 @@ class RestUnderForces:
     def whitened_products(self) -> tuple[FloatArray, float]:
         """The inner products (W, W) of the whitened columns, and half a log determinant [nat].
 
-        As those of `FilteredTrial`: the columns are the residual and its derivatives by the
-        unknowns, the determinant is that of the covariance of the readings.
+        As those of `FilteredTrial`: the columns are the residual and its derivatives with respect
+        to the unknowns, the determinant is that of the covariance of the readings.
         """
         columns = self.linear_trial.columns
         whitened_columns = np.linalg.solve(self._factor, columns).reshape(-1, columns.shape[-1])

@@ -144,15 +144,15 @@ class PortedProblem:
         return self.model.built_in_laws(parameters) + self.model.patch.of(PortForce)
 
     def _unknowns_of_model_laws(self, shared_values: FloatArray) -> tuple[int, ...]:
-        """Return the numbers of the shared unknowns that change the model's own laws.
+        """Return the indices of the shared unknowns that change the model's own laws.
 
         They are compared at values (K,) of the shared unknowns, and a small step away.
         """
         laws_at_point = self.evaluate_model_laws(shared_values)
         return tuple(
-            number
-            for number in range(self.problem.shared.parameter_count)
-            if self.evaluate_model_laws(with_step(shared_values, number, HALF_DIFFERENCE))
+            unknown
+            for unknown in range(self.problem.shared.parameter_count)
+            if self.evaluate_model_laws(with_step(shared_values, unknown, HALF_DIFFERENCE))
             != laws_at_point
         )
 

@@ -15,7 +15,7 @@ from reporting.arrays import LEAST_DIVISOR
 from .force_states import Process
 
 Processes = Mapping[int, Process]
-"""Missing forces as processes, by the numbers of their ports."""
+"""Missing forces as processes, by the index of the port."""
 
 PRIOR_LOG_DEVIATION_OF_AMPLITUDE, PRIOR_LOG_DEVIATION_OF_TIME = 3.0, 1.2
 """Prior standard deviations of the logarithms of amplitude and correlation time of a process. They
@@ -43,9 +43,9 @@ def prior_log_density(median_processes: Processes, processes: Processes) -> floa
     Parameters
     ----------
     median_processes : mapping of int to Process
-        The prior medians, by the number of the port.
+        The prior medians, by the index of the port.
     processes : mapping of int to Process
-        The missing forces as random processes, by the numbers of their ports.
+        The missing forces as random processes, by the index of the port.
     """
     log_ratios = np.log(
         [_ratios_to_median(process, median_processes[port]) for port, process in processes.items()]
@@ -103,7 +103,7 @@ class ProcessSearch:
             The function that takes processes by port, and returns the log of evidence times prior
             [nat].
         median_processes : mapping of int to Process
-            The prior medians, by the number of the port.
+            The prior medians, by the index of the port.
         initial_processes : mapping of int to Process
             The processes to begin with.
         time_range : (float, float)

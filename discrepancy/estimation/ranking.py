@@ -188,17 +188,19 @@ class _Ranking:
             screened_effects = [effect for effect in screened_effects if effect.rise > 0.0]
         promising_effects = screened_effects[:rough_count]
         rough_estimates = []
-        for number, screened_effect in enumerate(promising_effects):
+        for index, screened_effect in enumerate(promising_effects):
             candidate = base.candidate.with_term(screened_effect.term)
             if candidate.key in self.by_effects:
                 continue
-            remaining_count = len(promising_effects) - number - 1
+            remaining_count = len(promising_effects) - index - 1
             description = candidate.description
             self.on_progress(f"estimating {description} roughly, {remaining_count} more")
             estimates_of_effect = []
             for start in screened_effect.starts:
-                effect = np.concatenate((base.effect, start.effect))
-                estimate = self.search.estimate_roughly(base, candidate, effect, start.processes)
+                effect_values = np.concatenate((base.effect, start.effect))
+                estimate = self.search.estimate_roughly(
+                    base, candidate, effect_values, start.processes
+                )
                 if estimate is not None:
                     estimates_of_effect.append(estimate)
             if estimates_of_effect:
@@ -354,22 +356,24 @@ def _simpler_forms(candidate: Candidate, parameters: FloatArray) -> list[_Valued
     They inherit the scaled parameters (E,) of the set. The only effect of a set is not left out.
     """
     forms = []
-    numbers = range(len(candidate.terms))
-    if len(numbers) > 1:
-        for dropped_number in numbers:
-            remaining_numbers = [number for number in numbers if number != dropped_number]
-            smaller_set, values = candidate.subset_of_terms(remaining_numbers, parameters)
+    term_indices = range(len(candidate.terms))
+    if len(term_indices) > 1:
+        for dropped_index in term_indices:
+            remaining_indices = [
+                term_index for term_index in term_indices if term_index != dropped_index
+            ]
+            smaller_set, values = candidate.subset_of_terms(remaining_indices, parameters)
             forms.append(_ValuedCandidate(smaller_set, values))
-    for number, term in enumerate(candidate.terms):
+    for term_index, term in enumerate(candidate.terms):
         if not term.free_shape:
             continue
         canonical_term = replace(term, free_shape=False)
         terms = list(candidate.terms)
-        terms[number] = canonical_term
+        terms[term_index] = canonical_term
         parameters_by_term = [values for _, values in candidate.split_by_term(parameters)]
         # the parameters of the shape follow those of the canonical law
         canonical_count = len(canonical_term.parameters)
-        parameters_by_term[number] = parameters_by_term[number][:canonical_count]
+        parameters_by_term[term_index] = parameters_by_term[term_index][:canonical_count]
         forms.append(_ValuedCandidate(Candidate(tuple(terms)), np.concatenate(parameters_by_term)))
     return forms
 

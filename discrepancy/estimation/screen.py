@@ -64,14 +64,15 @@ other values, too [nat]."""
 
 
 class EffectColumn(NamedTuple):
-    """What an effect adds to a trial along a motion that is taken as known: forces or readings.
+    """The forces or changes of readings that an effect adds to a trial along a known motion.
 
     Attributes
     ----------
     forces : mapping of int to (F,) ndarray
-        The forces of the effect at the fine stamps, by the number of the port [N or N m].
+        The forces of the effect at the fine stamps, by the index of the port [N or N m].
     readings : (N, C) ndarray
-        The change of the readings by an effect that is no force, divided by the noise.
+        The change of the readings caused by an effect that is no force, divided by the standard
+        deviation of the noise.
     """
 
     forces: dict[int, FloatArray]
@@ -101,7 +102,7 @@ class ScreenedStart(NamedTuple):
     effect : (E,) ndarray
         The scaled parameters of the effect.
     processes : mapping of int to Process
-        The missing forces that remain beside the effect, by the number of the port.
+        The missing forces that remain beside the effect, by the index of the port.
     """
 
     log_evidence: float
@@ -167,7 +168,9 @@ def values_to_try(term: EffectTerm) -> list[FloatArray]:
     the zero of a clock, are tried all together, and each alone: their ratio is not known.
     """
     shape_indices = [
-        number for number, parameter in enumerate(term.parameters) if not parameter.magnitude
+        parameter_index
+        for parameter_index, parameter in enumerate(term.parameters)
+        if not parameter.magnitude
     ]
     levels = SHAPE_VALUES if len(shape_indices) < 2 else SHAPE_VALUES[::3]
     combinations = []
@@ -176,16 +179,16 @@ def values_to_try(term: EffectTerm) -> list[FloatArray]:
         values[shape_indices] = shape_values
         combinations.append(values)
     signed_magnitudes = [
-        number
-        for number, parameter in enumerate(term.parameters)
+        parameter_index
+        for parameter_index, parameter in enumerate(term.parameters)
         if parameter.magnitude and parameter.prior.low < 0.0
     ]
     if len(signed_magnitudes) > 1:
         for values in list(combinations):
-            for number in signed_magnitudes:
+            for parameter_index in signed_magnitudes:
                 single_magnitude = values.copy()
                 single_magnitude[signed_magnitudes] = 0.0
-                single_magnitude[number] = MAGNITUDE_VALUE
+                single_magnitude[parameter_index] = MAGNITUDE_VALUE
                 combinations.append(single_magnitude)
     return combinations
 
@@ -228,8 +231,8 @@ def _try_effects(
         for values in values_to_try(term):
             try:
                 columns = [
-                    _column_in_trial(laws, number, smoothed_trial, values)
-                    for number, smoothed_trial in enumerate(base.trials)
+                    _column_in_trial(laws, trial_index, smoothed_trial, values)
+                    for trial_index, smoothed_trial in enumerate(base.trials)
                 ]
             except (DiscrepancyError, InvalidPatchError) as cause:
                 search.ported.problem_with_laws.record_refusal(laws.candidate, cause)

@@ -16,7 +16,7 @@ difference of the channel. A kink of the response changes all readings instead."
 
 
 class DifferenceQuotient(NamedTuple):
-    """The derivative of a response by an unknown, and its jumps near the present value.
+    """The derivative of a response with respect to an unknown, and its jumps near its value.
 
     Attributes
     ----------

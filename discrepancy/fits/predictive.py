@@ -148,11 +148,11 @@ class _CovarianceFactors(NamedTuple):
     by_shared: FloatArray
 
     def local_variance(self) -> FloatArray:
-        """Return the variance (N C,) by the trial's own unknowns."""
+        """Return the variance (N C,) caused by the trial's own unknowns."""
         return np.asarray(np.einsum("kn,kn->n", self.by_local, self.by_local))
 
     def shared_variance(self) -> FloatArray:
-        """Return the variance (N C,) by the shared unknowns and effects."""
+        """Return the variance (N C,) caused by the shared unknowns and effects."""
         return np.asarray(np.einsum("nk,nk->n", self.by_shared, self.by_shared))
 
 

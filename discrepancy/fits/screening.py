@@ -2,14 +2,14 @@
 
 The nuisances are all unknowns of a fit that are not of interest here: calibrated parameters, gains,
 zeros and initial states. Let d be the standardised change that an effect makes to the prediction at
-the fitted nuisances, J the derivatives of the prediction by the nuisances (one row for each), r the
-residuals, g the negative gradient and H the Hessian of the fit's objective. To first order in the
-nuisances, the misfit after they are refitted is
+the fitted nuisances, J the derivatives of the prediction with respect to the nuisances (one row for
+each), r the residuals, g the negative gradient and H the Hessian of the fit's objective. To first
+order in the nuisances, the misfit after they are refitted is
 
     F(d) = F(0) - b(d) + G(d, d) / 2,
     G(c, d) = c.d - (J c)' H^-1 (J d),   b(d) = r.d - g' H^-1 (J d).
 
-Changes by several effects add, so pairs and scales of effects cost only inner products. G also
+Changes due to several effects add, so pairs and scales of effects cost only inner products. G also
 measures how well two effects can be told apart, before any data are known.
 """
 
@@ -171,39 +171,44 @@ class Screen:
         projections = change[len(change) - self._nuisance_count :]
         step = self._inverse_factor.T @ (self._whitened_gradient - projections)
         shared = point.shared + step[: len(point.shared)]
-        own_effect = point.effect.copy()
-        own_effect[: self._eliminated_count] += step[len(shared) :][: self._eliminated_count]
-        effect = np.concatenate((own_effect, effect_values))
+        own_effect_values = point.effect.copy()
+        own_effect_values[: self._eliminated_count] += step[len(shared) :][: self._eliminated_count]
+        all_effect_values = np.concatenate((own_effect_values, effect_values))
         local, residuals = [], []
-        squares = float(problem.shared.precision @ shared**2 + effect @ effect)
+        squared_sum = float(
+            problem.shared.precision @ shared**2 + all_effect_values @ all_effect_values
+        )
         first_reading = 0
         for rows, indices in self._trials:
             local.append(rows.local_values + step[indices[: len(rows.local_values)]])
-            squares += float(rows.local_precision @ local[-1] ** 2)
+            squared_sum += float(rows.local_precision @ local[-1] ** 2)
             trial_change = change[first_reading : first_reading + rows.residual.size]
             first_reading += rows.residual.size
             residual = rows.residual - trial_change - step[indices] @ rows.jacobian
             residuals.append(residual.reshape(-1, len(rows.precision_root)) / rows.precision_root)
         misfit = problem.misfit(problem.squares_by_channel(residuals))
-        return misfit + 0.5 * squares, Point(shared, tuple(local), effect)
+        return misfit + 0.5 * squared_sum, Point(shared, tuple(local), all_effect_values)
 
-    def misfit_rise(self, effect: FloatArray) -> float:
+    def misfit_rise(self, effect_values: FloatArray) -> float:
         """Return the rise of the misfit at other parameters (E,) of the fit's own effects [nat]."""
         candidate = self.fit.candidate
-        _, overlap, squared_length = self._project_change(candidate, effect, candidate.acts_on)
+        _, overlap, squared_length = self._project_change(
+            candidate, effect_values, candidate.acts_on
+        )
         return 0.5 * squared_length - overlap
 
     @np.errstate(over="ignore", invalid="ignore")
     def _project_change(
-        self, candidate: Candidate, effect: FloatArray, kinds: frozenset[TrialKind]
+        self, candidate: Candidate, effect_values: FloatArray, kinds: frozenset[TrialKind]
     ) -> tuple[FloatArray, float, float]:
         """Return what `project` returns for the change from the fit to another candidate.
 
-        `effect` (E,) are the scaled parameters of the candidate. Only trials of `kinds` change.
+        `effect_values` (E,) are the scaled parameters of the candidate. Only trials of the given
+        kinds change.
         """
         problem = self.problem
         point = self.fit.point
-        patch = candidate.patch(problem.setting, effect)
+        patch = candidate.patch(problem.setting, effect_values)
         standardised_changes: dict[int, FloatArray] = {}
         for trial_index, data in enumerate(problem.trials):
             if data.trial.kind not in kinds:
@@ -285,7 +290,7 @@ class Screen:
     def changes_on_grid(
         self, term: EffectTerm, *, with_small_magnitude: bool = True
     ) -> Iterator[ScreenedChange]:
-        """Yield the changes of the readings by an effect, over a grid of its parameters.
+        """Yield the changes of the readings that an effect causes, over a grid of its parameters.
 
         Points of the grid at which the model cannot be evaluated are left out.
 

@@ -197,21 +197,29 @@ class FmuSimulator(FmuAtRest):
     ) -> "StartState":
         """Return the state of the linear system at the start of a trial, and the laws' memory.
 
-        Under a recorded force the trial starts in equilibrium with its first value and the forces
-        of the J laws. Without laws, or without a recorded force, it starts as released, and the
-        laws have no memory of earlier displacements.
+        The J laws are internal forces at ports, such as friction. The memory holds what they need
+        of earlier displacements.
+
+        - With laws and a recorded force, the trial starts at rest, in equilibrium with the first
+          value of the recorded force and the forces of the laws. A positive force of a law acts
+          against the displacement of its port.
+        - Otherwise it starts in the state given by `release_values`, the values of the release
+          variables, and the laws have no memory.
+
+        The linear system has C outputs and E force inputs.
         """
         if not len(laws) or excitation.force is None:
             return StartState(self._start_state(system, excitation, release_values), None)
         first_forces = excitation.first_force * excitation.force_factor_values  # (E,)
-        gain = system.gain  # (C, E)
-        outputs = self._undisturbed_outputs(excitation) + gain @ first_forces
+        static_gain = system.gain  # (C, E), outputs at rest under unit forces
+        outputs = self._undisturbed_outputs(excitation) + static_gain @ first_forces
         positions_without_laws = outputs[ports.columns]  # (J,), of the port of each law
-        compliance = gain[np.ix_(ports.columns, ports.force_indices)]  # (J, J)
+        # the static gains from forces to displacements of ports are their compliance (J, J)
+        compliance = static_gain[np.ix_(ports.columns, ports.force_indices)]
         solution = static_solution(
             laws, positions_without_laws[None], compliance, kernel=compiled_kernel()
         )
-        # the sum of the forces of laws on each of the E inputs
+        # several laws may act at one port: the sum of their forces on each of the E inputs
         law_forces = np.bincount(ports.force_indices, solution.forces[0], len(first_forces))
         return StartState(system.state_at_rest(first_forces - law_forces), solution.memory)
 

@@ -97,7 +97,7 @@ class Comparison(ABC, Generic[HypothesisT]):
         """Return the share of the gap that a hypothesis explains, in fitted or held-out trials."""
 
     @abstractmethod
-    def fit_candidate(self, candidate: Candidate, effect: FloatArray) -> HypothesisT | None:
+    def fit_candidate(self, candidate: Candidate, effect_values: FloatArray) -> HypothesisT | None:
         """Return the fit of a further candidate, from scaled effect parameters (E,).
 
         None if it cannot be fitted.

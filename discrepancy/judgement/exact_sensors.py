@@ -113,7 +113,7 @@ def _expected_drop(
 
 
 class _ChannelDerivative(NamedTuple):
-    """The residuals of a channel in a trial, and their derivative by a zero or gain.
+    """The residuals of a channel in a trial, and their derivative with respect to a zero or gain.
 
     Attributes
     ----------

@@ -61,13 +61,13 @@ class ForceComparison(Comparison[Estimate]):
         """Return the share of the missing force that a hypothesis explains."""
         return self._force_shares.gap_share(hypothesis, held_out=held_out)
 
-    def fit_candidate(self, candidate: Candidate, effect: FloatArray) -> Estimate | None:
+    def fit_candidate(self, candidate: Candidate, effect_values: FloatArray) -> Estimate | None:
         """Return the estimate of a further candidate, from scaled effect parameters (E,).
 
         None if the candidate is not possible.
         """
         return self.force_search.estimate_effects(
-            self.force_search.estimate_without_effects, candidate, effect
+            self.force_search.estimate_without_effects, candidate, effect_values
         )
 
     def fit_with_free_shape(self, hypothesis: Estimate) -> Estimate | None:

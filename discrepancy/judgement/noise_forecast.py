@@ -1,6 +1,6 @@
 """Whether less noise would show an effect, and which unknowns could imitate it otherwise.
 
-Let d be the change of the readings by an effect, over their noise, and J the derivatives of the
+Let d be the change of the readings due to an effect, over their noise, and J the derivatives of the
 readings with respect to the U unknowns that are fitted under every hypothesis (one row for each).
 Let P be the prior precisions of these unknowns. With a noise variance that is n times smaller, the
 squared distance of the effect from the model without it is
@@ -28,7 +28,8 @@ from discrepancy.fits.trial_data import TrialData
 LARGEST_NOISE_REDUCTION = 100.0
 """How many times smaller the noise may have to be; more is beyond any instrument."""
 LEAST_PART_IN_IMITATION = 0.2
-"""Least change of the readings by an unknown, over the largest such change, for it to be named."""
+"""Least change of the readings due to an unknown, over the largest such change, for it to be
+named."""
 MOST_NAMED_UNKNOWNS = 3
 """Largest number of unknowns that are named."""
 

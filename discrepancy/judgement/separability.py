@@ -118,7 +118,7 @@ class Separability:
     identifiers : tuple of str
         The effects that can be tested: the rows and columns of `distance`.
     distance : (E, E) array
-        The squared distance of the change by the row's effect from the nearest change that the
+        The squared distance of the change due to the row's effect from the nearest change that the
         column's effect can make [sigma^2]. The row's effect is at its prior median, or at the least
         detectable size if that is larger.
     groups : tuple of tuple of str
@@ -285,7 +285,7 @@ class _SmallChange(NamedTuple):
 
 
 def _all_changes(screen: Screen, effect: Effect) -> list[ScreenedChange]:
-    """Return the changes by an effect over the grid of its parameters, at all its places."""
+    """Return the changes due to an effect over the grid of its parameters, at all its places."""
     changes: list[ScreenedChange] = []
     for place in effect.places(screen.problem.setting):
         changes.extend(screen.changes_on_grid(EffectTerm(effect, place)))
@@ -295,7 +295,7 @@ def _all_changes(screen: Screen, effect: Effect) -> list[ScreenedChange]:
 def _reference_change(
     screen: Screen, effect: Effect, options: Sequence[ScreenedChange]
 ) -> ScreenedChange | None:
-    """Return the largest change of the readings by an effect at its prior median.
+    """Return the largest change of the readings due to an effect at its prior median.
 
     If the change is not detectable, the other parameters, such as a place along the span, are
     varied as in `options`, the changes over a grid. If the model cannot be evaluated at the median,
@@ -319,7 +319,7 @@ def _largest_change(changes: Sequence[ScreenedChange]) -> ScreenedChange:
 
 
 def _changes_at_prior_median(screen: Screen, effect: Effect) -> list[ScreenedChange]:
-    """Return the changes by an effect at its prior median, one for each of its places.
+    """Return the changes due to an effect at its prior median, one for each of its places.
 
     A signed magnitude, whose median is zero, is at one prior deviation. Places at which the model
     cannot be evaluated with the effect are left out.
@@ -481,7 +481,7 @@ class _ReachableChanges:
     screen : Screen
         The fit whose inner product measures distances.
     options : sequence of ScreenedChange
-        The changes by the effect over a grid of its parameters.
+        The changes due to the effect over a grid of its parameters.
     """
 
     def __init__(self, screen: Screen, options: Sequence[ScreenedChange]) -> None:

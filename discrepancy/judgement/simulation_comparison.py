@@ -152,7 +152,7 @@ class SimulationComparison(Comparison[CandidateFit]):
         """The fits that converged under the recorded noise."""
         return self.search.exact_fits
 
-    def fit_candidate(self, candidate: Candidate, effect: FloatArray) -> CandidateFit | None:
+    def fit_candidate(self, candidate: Candidate, effect_values: FloatArray) -> CandidateFit | None:
         """Return the fit of a further candidate, from scaled effect parameters (E,).
 
         None if the candidate cannot be fitted.
@@ -160,7 +160,7 @@ class SimulationComparison(Comparison[CandidateFit]):
         no_effect = self.search.no_effect
         exact_fit = self._exact_fits.get(candidate.key)
         if exact_fit is None:
-            start = Point(no_effect.point.shared, no_effect.point.local, effect)
+            start = Point(no_effect.point.shared, no_effect.point.local, effect_values)
             exact_fit = try_fit(self.problem, candidate, start)
         return None if exact_fit is None else self._fit_under_compared_noise(exact_fit)
 

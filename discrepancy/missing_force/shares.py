@@ -40,7 +40,7 @@ SMOOTHING_ROUNDS = 3
 
 
 PortForces = Mapping[int, FloatArray]
-"""Forces (F,) at the ports of a trial, by the number of the port."""
+"""Forces (F,) at the ports of a trial, by the index of the port."""
 
 
 class _BlockSums(NamedTuple):
@@ -277,7 +277,7 @@ def _squares_of_weighted_forces(
 ) -> float:
     """Return the sum of squares of weighted forces over all ports, and over a slice of fine stamps.
 
-    Forces (F,) and weights are given by the number of the port.
+    Forces (F,) and weights are given by the index of the port.
     """
     total = 0.0
     for port, force in forces.items():

@@ -85,7 +85,7 @@ def si_sizes(
             motion = _motion_text(primitive.motion)
             name = f"the interface {primitive.interface} {motion} against a spring of"
         if isinstance(primitive, PlaceMass):
-            place_text = _point_text(size.primitive, primitive, intervals, model)
+            place_text = _text_of_offset_mass(size.primitive, primitive, intervals, model)
         else:
             place_text = _location_text(primitive, size, model, campaign)
         sizes[f"{name} {rounded(size.value, half_width)} {unit}{interval}{place_text}"] = None
@@ -93,15 +93,15 @@ def si_sizes(
 
 
 def _as_spring(
-    size: PrimitiveInterval, primitive: SupportCompliance | InterfaceCompliance
+    interval: PrimitiveInterval, primitive: SupportCompliance | InterfaceCompliance
 ) -> PrimitiveInterval:
     """Return the interval of the spring of what yields: the inverse of its compliance."""
     turns = primitive.motion.startswith("r")
     return replace(
-        size,
-        value=1.0 / size.value,
-        low=1.0 / size.high,
-        high=1.0 / size.low,
+        interval,
+        value=1.0 / interval.value,
+        low=1.0 / interval.high,
+        high=1.0 / interval.low,
         unit="N m/rad" if turns else "N/m",
     )
 
@@ -160,15 +160,15 @@ def _size_name(parameter: str, primitive: Primitive, unit: str) -> str:
 
 
 def _location_text(
-    primitive: Primitive, size: PrimitiveInterval, model: Model, campaign: Campaign
+    primitive: Primitive, interval: PrimitiveInterval, model: Model, campaign: Campaign
 ) -> str:
     """Return where a size holds: a force's reference speed or displacement, or a mass's station.
 
     It is a phrase such as " at 0.3 m/s"; empty for other sizes.
     """
-    if primitive.kind == "point_mass" and size.parameter == "mass":
+    if primitive.kind == "point_mass" and interval.parameter == "mass":
         return f" at {getattr(primitive, 'station'):.3g} m"  # noqa: B009
-    if size.parameter != "coefficient":
+    if interval.parameter != "coefficient":
         return ""
     marks = []
     for exponent in ("velocity_exponent", "displacement_exponent", "exponent"):
@@ -183,25 +183,29 @@ def _location_text(
     return f" at {' and '.join(marks)}" if marks else ""
 
 
-def _point_text(
-    number: int, primitive: PlaceMass, intervals: Sequence[PrimitiveInterval], model: Model
+def _text_of_offset_mass(
+    primitive_index: int,
+    primitive: PlaceMass,
+    intervals: Sequence[PrimitiveInterval],
+    model: Model,
 ) -> str:
-    """Return the point of a mass beside a place and how precisely it is known; empty at a place.
+    """Return the position of a mass that is offset from its named place, with its uncertainty.
 
-    `number` is that of the primitive in its patch.
+    The text is empty if the mass is at the place itself. `primitive_index` is the index of the mass
+    in its patch.
     """
     location = model.point_of_mass(primitive)
     if location is None:
         return ""
     precisions = []
     for parameter, axis in zip(("along", "across"), location.axes, strict=True):
-        for size in intervals:
-            is_of_mass = size.primitive == number and size.parameter == parameter
-            if is_of_mass and isfinite(size.low) and isfinite(size.high):
-                half_width = 0.5 * (size.high - size.low)
+        for interval in intervals:
+            is_of_mass = interval.primitive == primitive_index and interval.parameter == parameter
+            if is_of_mass and isfinite(interval.low) and isfinite(interval.high):
+                half_width = 0.5 * (interval.high - interval.low)
                 precisions.append(f"to {half_width:.2g} m along {_vector_text(axis, 2)}")
-    known = f", known {' and '.join(precisions)}" if precisions else ""
-    return f" at {_vector_text(location.point, 4)} m{known}"
+    uncertainty = f", known {' and '.join(precisions)}" if precisions else ""
+    return f" at {_vector_text(location.point, 4)} m{uncertainty}"
 
 
 def _vector_text(vector: FloatArray, digits: int) -> str:

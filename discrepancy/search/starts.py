@@ -51,8 +51,8 @@ def report_each(
     describe : callable
         Returns a phrase on how an item is processed, such as "fitting gain".
     """
-    for number, item in enumerate(items):
-        remaining_count = len(items) - number - 1
+    for index, item in enumerate(items):
+        remaining_count = len(items) - index - 1
         on_progress(f"{describe(item)}, {remaining_count} more")
         yield item
 
@@ -339,14 +339,14 @@ def _best_places(
         return _grid_points(early_problem, early_base, screen, effect, [place], place_levels)
 
     half_step = SEARCH.coarse_level_step // 2
-    coarse_numbers = np.arange(half_step, len(levels), SEARCH.coarse_level_step)
+    coarse_indices = np.arange(half_step, len(levels), SEARCH.coarse_level_step)
     best_of_places = []
     for place in places:
-        coarse = points_at(place, levels[coarse_numbers])
+        coarse = points_at(place, levels[coarse_indices])
         if not coarse:
             continue
-        number = int(np.argmin(np.abs(levels - coarse[0].start.point.effect[len(base.effect)])))
-        nearby = levels[max(number - half_step, 0) : number + half_step + 1]
+        best_index = int(np.argmin(np.abs(levels - coarse[0].start.point.effect[len(base.effect)])))
+        nearby = levels[max(best_index - half_step, 0) : best_index + half_step + 1]
         fine = points_at(place, nearby)
         best_of_places.append(min((*coarse, *fine), key=lambda point: point.objective))
     best_of_places.sort(key=lambda point: float(f"{point.objective:.1e}"))
@@ -354,17 +354,17 @@ def _best_places(
     if not problem.model.nuisance_parameters:
         return best_of_places
     points = []
-    for best in best_of_places:
+    for best_point in best_of_places:
         early_fit = try_fit(
             early_problem,
-            best.start.candidate,
-            best.start.point,
+            best_point.start.candidate,
+            best_point.start.point,
             nearby_derivatives=early_base.trial_derivatives,
             iterations=SEARCH.rough_fit_iterations,
         )
         if early_fit is not None:
-            start = best.start._replace(point=early_fit.point)
-            points.append(_GridPoint(early_fit.objective, best.place, start))
+            start = best_point.start._replace(point=early_fit.point)
+            points.append(_GridPoint(early_fit.objective, best_point.place, start))
     return points
 
 

@@ -166,18 +166,19 @@ class EffectLaws:
         return laws_of_model + changes.of(PortForce)
 
     def _linearised_forces(self, arguments: LawArguments) -> dict[int, LinearisedForce]:
-        """Return the forces of all laws at each port, with their derivatives by unknowns.
+        """Return the forces of all laws at each port, with their derivatives.
 
-        The K shared unknowns are numbered first, then those of the effects. For the derivative by
-        an unknown only the laws that it changes are evaluated: those of the model or of one effect.
+        The derivatives are those with respect to the unknowns: first the K shared ones, then those
+        of the effects. For each, only the laws that it changes are evaluated: those of the model or
+        of one effect.
         """
         forces = self._forces_of_patch(arguments, self.evaluate_model_laws(arguments.shared))
         by_model = {port: force.force for port, force in forces.items()}
         derivatives: dict[int, dict[int, FloatArray]] = defaultdict(dict)
-        for number in self.unknowns_of_model_laws:
-            slopes = self._slopes(arguments, self.evaluate_model_laws, arguments.shared, number)
+        for unknown in self.unknowns_of_model_laws:
+            slopes = self._slopes(arguments, self.evaluate_model_laws, arguments.shared, unknown)
             for port, slope in slopes.items():
-                derivatives[port][number] = slope
+                derivatives[port][unknown] = slope
 
         first_unknown = len(arguments.shared)
         for index, (term, values) in enumerate(self.candidate.split_by_term(arguments.effect)):
@@ -188,10 +189,12 @@ class EffectLaws:
             if forces_of_term:  # else it changes readings, see `_linearised_sensor_errors`
                 # a force of free shape is linear in its amplitudes
                 forces_below = forces_of_term if term.effect.table is not None else None
-                for number in range(len(values)):
-                    slopes = self._slopes(arguments, laws_of_term, values, number, forces_below)
+                for value_index in range(len(values)):
+                    slopes = self._slopes(
+                        arguments, laws_of_term, values, value_index, forces_below
+                    )
                     for port, slope in slopes.items():
-                        derivatives[port][first_unknown + number] = slope
+                        derivatives[port][first_unknown + value_index] = slope
             first_unknown += len(values)
         return {
             port: LinearisedForce(force, derivatives[port], by_model.get(port, 0.0))
@@ -203,7 +206,7 @@ class EffectLaws:
         arguments: LawArguments,
         laws_at: Callable[[FloatArray], ModelPatch],
         values: FloatArray,
-        number: int,
+        unknown: int,
         forces_below: Mapping[int, LawForce] | None = None,
     ) -> dict[int, FloatArray]:
         """Return the derivative (F,) of the force at each port by one unknown, where not zero.
@@ -216,7 +219,7 @@ class EffectLaws:
             Returns the laws for given values of some unknowns.
         values : array
             The present values of these unknowns.
-        number : int
+        unknown : int
             The index of the one unknown among them.
         forces_below : mapping of int to LawForce, optional
             The forces at the present values. If given, the derivative is a one-sided difference,
@@ -224,9 +227,9 @@ class EffectLaws:
         """
         difference = HALF_DIFFERENCE
         if forces_below is None:
-            below = laws_at(with_step(values, number, -HALF_DIFFERENCE))
+            below = laws_at(with_step(values, unknown, -HALF_DIFFERENCE))
             forces_below, difference = self._forces_of_patch(arguments, below), 2.0 * difference
-        above = laws_at(with_step(values, number, HALF_DIFFERENCE))
+        above = laws_at(with_step(values, unknown, HALF_DIFFERENCE))
         forces_above = self._forces_of_patch(arguments, above)
         slopes = {}
         for port in forces_above.keys() & forces_below.keys():
@@ -235,10 +238,10 @@ class EffectLaws:
                 slopes[port] = rise / difference
         return slopes
 
-    def _patch_in_trial(self, trial_index: int, effect: FloatArray) -> ModelPatch:
+    def _patch_in_trial(self, trial_index: int, effect_values: FloatArray) -> ModelPatch:
         """Return the change of the model by the effects (E,) in a trial, given by its index."""
         primitives: list[Primitive] = []
-        for index, (_, values) in enumerate(self.candidate.split_by_term(effect)):
+        for index, (_, values) in enumerate(self.candidate.split_by_term(effect_values)):
             primitives += self._patch_of_term_in_trial(trial_index, index, values)
         return ModelPatch(tuple(primitives))
 
@@ -273,7 +276,7 @@ class EffectLaws:
         return patch_of_term
 
     def _forces_of_patch(self, arguments: LawArguments, patch: ModelPatch) -> dict[int, LawForce]:
-        """Return the forces of a patch's laws along a trajectory, by the number of the port.
+        """Return the forces of a patch's laws along a trajectory, by the index of the port.
 
         The forces of several laws at one port are added.
         """
@@ -308,9 +311,11 @@ class EffectLaws:
     def _linearised_sensor_errors(
         self, arguments: LawArguments, linearised_forces: Mapping[int, LinearisedForce]
     ) -> LinearisedSensorErrors:
-        """Return how errors of sensors change a trial's readings, with the derivatives by unknowns.
+        """Return the change of a trial's readings due to errors of sensors, and its derivatives.
 
-        `linearised_forces` are the forces of all laws, by the number of the port.
+        The derivatives are those with respect to the unknowns.
+
+        `linearised_forces` are the forces of all laws, by the index of the port.
         """
         trial = self.trials[arguments.trial_index]
         change = np.zeros_like(trial.residual)
@@ -349,7 +354,7 @@ class EffectLaws:
     def readings_change(
         self, trial_index: int, trajectory: Trajectory, term: EffectTerm, values: FloatArray
     ) -> FloatArray:
-        """Return the change (N, C) of a trial's readings by an effect that is no force at a port.
+        """Return the change (N, C) of a trial's readings due to an effect that is no port force.
 
         Such an effect is an error of a sensor or of a clock, for example. The change is divided by
         the noise. It is zero if the effect does not act in trials of this kind.

@@ -1,4 +1,4 @@
-"""The force of a law along a motion, and its derivatives by the motion (tangents)."""
+"""The force of a law along a motion, and its tangents: derivatives with respect to the motion."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -75,7 +75,9 @@ class PortMotion:
 
 @dataclass(frozen=True, eq=False)
 class LawForce:
-    """The force of laws at a port along its motion, with its derivatives by the motion (tangents).
+    """The force of laws at a port along its motion, with its tangents.
+
+    Tangents are derivatives with respect to the motion.
 
     A force is counted positive if it acts against the motion.
 

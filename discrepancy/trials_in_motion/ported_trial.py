@@ -266,7 +266,9 @@ def _substep_count(system: PortedSystem, time: FloatArray) -> int:
 def _port_motion(
     problem: Problem, trial_index: int, point: Point, substeps: int
 ) -> tuple[FloatArray, dict[int, FloatArray]]:
-    """Return the motion of the ports by the model alone, and its derivatives by the unknowns.
+    """Return the motion of the ports caused by the model alone, and its derivatives.
+
+    The derivatives are those with respect to the unknowns.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Changes of readings by effects that are no forces at ports: errors of sensors, changed models."""
+"""Changes of readings due to errors of sensors and changed models, which are no port forces."""
 
 from dataclasses import dataclass
 
@@ -18,7 +18,7 @@ from .trial_at_rest import LinearTrial
 
 @dataclass(frozen=True, eq=False)
 class ReadingChanges:
-    """Computes the changes of readings by effects that are no forces at ports.
+    """Computes the changes of readings caused by effects that are no forces at ports.
 
     Attributes
     ----------
@@ -35,7 +35,7 @@ class ReadingChanges:
         trial_index: int,
         patch: ModelPatch,
     ) -> FloatArray:
-        """Return the change (N, C) of a trial's readings by a patch, divided by the noise.
+        """Return the change (N, C) of a trial's readings due to a patch, divided by the noise.
 
         Changes of the structure and of the clock are simulated; other errors of sensors act on the
         motion that they measure.
@@ -62,7 +62,7 @@ class ReadingChanges:
     def _readings_of_changed_model(
         self, trial: LinearTrial, trial_index: int, patch: ModelPatch
     ) -> FloatArray:
-        """Return the simulated change (N, C) of the readings by a patch, divided by the noise.
+        """Return the simulated change (N, C) of the readings due to a patch, divided by the noise.
 
         It is the response of the patched model minus that of the model. The estimated motion is not
         used.

@@ -188,7 +188,9 @@ def solve_forces(
     forces: FloatArray,
     tangents: FloatArray,
 ) -> None:
-    """Fill the laws' forces (P,) at the end of a substep, and their tangents (P, n) by the state.
+    """Fill the laws' forces (P,) at the end of a substep, and their tangents (P, n).
+
+    Tangents are the derivatives with respect to the state.
 
     Parameters
     ----------

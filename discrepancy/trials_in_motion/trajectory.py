@@ -22,7 +22,7 @@ class Trajectory:
     positions, speeds : (F, P) ndarray
         The motion of the P ports [m or rad, and per s].
     forces : mapping of int to (F,) ndarray
-        The force at a port that the linear model does not contain, by the number of the port [N or
+        The force at a port that the linear model does not contain, by the index of the port [N or
         N m].
     """
 
@@ -88,7 +88,7 @@ class LinearisedForce:
     Attributes
     ----------
     law_force : LawForce
-        The force of all laws at the port, and its derivatives by the motion.
+        The force of all laws at the port, and its derivatives with respect to the motion.
     by_unknown : mapping of int to (F,) ndarray
         The derivatives of the force by unknowns, by the number of the unknown.
     by_model : (F,) ndarray or float
@@ -128,7 +128,7 @@ class LinearisedSensorErrors:
     change : (N, C) ndarray
         The change at the present values of the unknowns.
     by_unknown : mapping of int to (N, C) ndarray
-        The derivatives of the change by unknowns, by the number of the unknown.
+        The derivatives of the change with respect to unknowns, by the index of the unknown.
     """
 
     change: FloatArray

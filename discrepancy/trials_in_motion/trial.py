@@ -89,8 +89,8 @@ class SubstepMatrices(NamedTuple):
     transitions : (J, n, n) ndarray
         The transitions of the state.
     by_input_at_begin, by_input_at_end : (J, n, n) ndarray
-        The derivatives of the next state by an input to the state's rate at the start and at the
-        end of the substep. The input is linear over the substep (first-order hold).
+        The derivatives of the next state with respect to an input to the state's rate at the start
+        and at the end of the substep. The input is linear over the substep (first-order hold).
     """
 
     transitions: FloatArray
@@ -121,8 +121,8 @@ class PortedTrial:
     coloured_noises : sequence of ColouredNoise
         The parts of noises that are correlated in time.
     shared_derivatives, local_derivatives : (K, N, C), (L, N, C) ndarray
-        The derivatives of the readings by the shared unknowns, and by those of this trial alone,
-        divided by the noise deviations.
+        The derivatives of the readings with respect to the shared unknowns, and to those of this
+        trial alone, divided by the standard deviations of the noise.
     local_precision : (L,) ndarray
         The prior precisions of the unknowns of this trial alone.
     system : PortedSystem
@@ -254,7 +254,7 @@ class PortedTrial:
         unknowns : (K + L,) array
             The values of the K unknowns that all trials share, then of the L of this trial alone.
         added_state : (F, n) array
-            The change of the state by forces at ports.
+            The change of the state caused by forces at ports.
 
         Returns
         -------
@@ -391,7 +391,7 @@ class PortedTrial:
         states : (F, n) array
             The state that missing forces and laws add, at the fine stamps.
         forces : mapping of int to (F,) array
-            The forces at ports, which an acceleration shows directly, by the number of the port.
+            The forces at ports, which an acceleration shows directly, by the index of the port.
         """
         return self.divide_by_noise(self.outputs_of_state(self.system, states, forces))
 
@@ -403,11 +403,11 @@ class PortedTrial:
         Parameters
         ----------
         system : PortedSystem
-            The system of the trial, or its derivative by a parameter.
+            The system of the trial, or its derivative with respect to a parameter.
         states : (F, n) array
             The state that missing forces and laws add, at the fine stamps.
         forces : mapping of int to (F,) array
-            The forces at ports, which an acceleration shows directly, by the number of the port.
+            The forces at ports, which an acceleration shows directly, by the index of the port.
         """
         readings = states[:: self.substeps] @ system.outputs.T
         for port, force in forces.items():

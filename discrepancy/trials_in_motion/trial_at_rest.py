@@ -48,8 +48,8 @@ class TrialAtRest:
     deviation : (C,) ndarray
         The standard deviation of the noise of each channel [unit of the channel].
     shared_derivatives, local_derivatives : (K, N, C), (L, N, C) ndarray
-        The derivatives of the readings by the shared unknowns, and by those of this trial alone,
-        divided by the noise deviations.
+        The derivatives of the readings with respect to the shared unknowns, and to those of this
+        trial alone, divided by the standard deviations of the noise.
     local_precision : (L,) ndarray
         The prior precisions of the unknowns of this trial alone.
     response : PortsAtRest
@@ -100,15 +100,15 @@ class TrialAtRest:
             The values of the K unknowns that all trials share, then of the L of this trial alone.
         """
         positions = self.response.positions.copy()
-        for number, derivative in self.response_derivatives.items():
-            change = unknowns[number] - self.linearisation_point[number]
+        for unknown, derivative in self.response_derivatives.items():
+            change = unknowns[unknown] - self.linearisation_point[unknown]
             positions += change * derivative.positions
         return positions
 
     def trajectory_at(self, positions: FloatArray, forces: Mapping[int, FloatArray]) -> Trajectory:
         """Return given positions (N, P) of the ports as a trajectory without speed.
 
-        `forces` (N,) are those that the linear model does not contain, by the number of the port.
+        `forces` (N,) are those that the linear model does not contain, by the index of the port.
         """
         return Trajectory(
             added_state=np.zeros((len(self.time), 0)),
@@ -139,9 +139,9 @@ class TrialAtRest:
     def added_positions(
         self, response: PortsAtRest, forces: Mapping[int, FloatArray]
     ) -> FloatArray:
-        """Return what forces (N,) at ports, by port, add to the positions (N, P) of all ports.
+        """Return the change of the positions (N, P) of all ports caused by forces (N,) at ports.
 
-        `response` is that of the trial, or its derivative by an unknown.
+        `response` is that of the trial, or its derivative with respect to an unknown.
         """
         positions = np.zeros_like(response.positions)
         for port, force in forces.items():
@@ -164,7 +164,7 @@ class TrialAtRest:
     def readings_of_forces_in_block(
         self, forces: Mapping[int, FloatArray], begin: int, end: int
     ) -> FloatArray:
-        """Return the readings (B, C) by forces in a block of B load steps, over the noise."""
+        """Return the whitened readings (B, C) that forces cause in a block of B load steps."""
         return self.readings_of_forces(self.response, forces)[begin:end]
 
     def readings_of_state(self, states: FloatArray, forces: Mapping[int, FloatArray]) -> FloatArray:
@@ -281,9 +281,9 @@ def _with_readings(response: PortsAtRest, readings_per_output: FloatArray) -> Po
 def _response_and_derivatives(
     problem: Problem, trial_index: int, point: Point
 ) -> tuple[PortsAtRest, dict[int, PortsAtRest]]:
-    """Return the ports at rest at a point, and their derivatives by the unknowns.
+    """Return the ports at rest at a point, and their derivatives with respect to the unknowns.
 
-    The derivatives are given by the number of the unknown in `TrialAtRest.linearisation_point`.
+    The derivatives are given by the index of the unknown in `TrialAtRest.linearisation_point`.
     """
     data = problem.trials[trial_index]
     layout = problem.shared

@@ -229,7 +229,7 @@ class _Columns:
         return np.array([self.held_terms.theta(state) for state in states])
 
     def _unit_responses(self, motion: SupportMotion, thetas: FloatArray) -> FloatArray:
-        """Return the displacements (n, B) by a unit motion of a support, in B states.
+        """Return the displacements (n, B) under a unit motion of a support, in B states.
 
         A support on a spring gets a unit force instead. `thetas` (B, T) are the coefficients of the
         T stiffness terms in each state.

@@ -42,37 +42,54 @@ def case_error(
 ) -> float:
     """Return the largest relative error of static outputs and natural frequencies in one case.
 
-    The error of a frequency is its change by one step of inverse iteration with the full model.
-
     Parameters
     ----------
     terms, held_terms : ReductionTerms
         Terms of the structure whose supports yield, and of the one whose supports are held.
     shapes : (n', M) array
-        The reduced mode shapes on all unknowns.
+        The M reduced mode shapes on all n' unknowns of the full model.
+    """
+    return max(
+        _error_of_statics(case, model, terms, held_terms), _error_of_frequencies(case, shapes)
+    )
+
+
+def _error_of_statics(
+    case: ChangedCase, model: ChangeableModel, terms: ReductionTerms, held_terms: ReductionTerms
+) -> float:
+    """Return the largest error of an output under a load, over the largest output of its group.
+
+    The outputs (O, L) of the full and of the reduced model are compared under L loads.
     """
     structure = case.structure
-    # statics: outputs (O, L) of the full and of the reduced model under each load
+    # The reduced model has the loads of the structure with held supports. If supports yield, there
+    # are more, such as a load on held nodes. A load is identified by its control and free mass.
     factors = terms.load_factors.tolist()
-    load_numbers = [factors.index(row) for row in held_terms.load_factors.tolist()]
-    outputs = terms.outputs.T @ case.full_solution(terms.loads[:, load_numbers])
+    load_indices = [factors.index(row) for row in held_terms.load_factors.tolist()]
+    outputs = terms.outputs.T @ case.full_solution(terms.loads[:, load_indices])
     displacements = structure.basis @ structure.static(structure.basis.T @ model.whole_load.T)
+    # the reduced model also has accelerations, after the strains and displacements
     reduced_outputs = model.whole_output[: len(outputs)] @ displacements
     largest_error = 0.0
     for group in terms.groups:
-        largest = np.abs(outputs[group]).max(axis=0)
-        difference = np.abs(reduced_outputs[group] - outputs[group]).max(axis=0)
-        responds = largest > 0.0
-        largest_error = max(
-            largest_error, float((difference[responds] / largest[responds]).max(initial=0.0))
-        )
-    # Frequencies: with the shapes improved by inverse iteration, K u = M phi, the Rayleigh quotient
-    # is omega^2 = u^T K u / u^T M u = u^T M phi / u^T M u.
+        largest_by_load = np.abs(outputs[group]).max(axis=0)
+        difference_by_load = np.abs(reduced_outputs[group] - outputs[group]).max(axis=0)
+        has_response = largest_by_load > 0.0
+        errors = difference_by_load[has_response] / largest_by_load[has_response]
+        largest_error = max(largest_error, float(errors.max(initial=0.0)))
+    return largest_error
+
+
+def _error_of_frequencies(case: ChangedCase, shapes: FloatArray) -> float:
+    """Return the largest relative change of a frequency by a step of inverse iteration.
+
+    The step is made with the full model, from the reduced shapes phi (n', M) to improved ones u:
+    K u = M phi. The Rayleigh quotient of u is omega^2 = u^T K u / u^T M u = u^T M phi / u^T M u.
+    """
     inertia = case.mass @ shapes
     improved_shapes = case.full_solution(inertia)
     stiffness_products = np.sum(improved_shapes * inertia, axis=0)
     mass_products = np.sum(improved_shapes * (case.mass @ improved_shapes), axis=0)
-    squares = stiffness_products / mass_products
-    frequency = np.sqrt(squares) / (2.0 * np.pi)
-    frequency_errors = np.abs(structure.modes.frequency / frequency - 1.0)
-    return max(largest_error, float(frequency_errors.max()))
+    squared_angular_frequency = stiffness_products / mass_products
+    frequency = np.sqrt(squared_angular_frequency) / (2.0 * np.pi)
+    return float(np.abs(case.structure.modes.frequency / frequency - 1.0).max())

@@ -427,9 +427,11 @@ _WINDOW_TYPES: dict[str, type] = {"trial": str, "begin": float, "end": float}
 
 def _primitive_from_row(row: object, where: str) -> Primitive:
     """Build a primitive from a row of a file; raise `InvalidPatchError` as `from_list` does."""
+    # files of earlier versions have a kind of its own for the compliance of the root's turn
     if isinstance(row, Mapping) and row.get("kind") == FORMER_ROOT_COMPLIANCE:
         support, motion = ROOT_TURN
         row = {**row, "kind": SupportCompliance.kind, "support": support, "motion": motion}
+    # a row that is no table is shown whole in the place of its kind
     kind = row.get("kind") if isinstance(row, Mapping) else row
     if not isinstance(row, Mapping) or not isinstance(kind, str) or kind not in PRIMITIVES:
         raise InvalidPatchError(
@@ -469,13 +471,13 @@ def _checked_values(
         if name not in types:
             raise InvalidPatchError(f"{where} has no value {name!r}; it has {', '.join(types)}.")
         value_type = types[name]
-        numbers = value if isinstance(value, list | tuple) else ()
+        elements = value if isinstance(value, list | tuple) else ()
         if not _is_accepted(value, value_type) or not all(
-            _is_accepted(number, float) for number in numbers
+            _is_accepted(element, float) for element in elements
         ):
             type_name = _NAMES_OF_TYPES[value_type]
             raise InvalidPatchError(f"{where}: {name} must be {type_name}, but is {value!r}.")
-        checked[name] = tuple(map(float, numbers)) if value_type is tuple else value_type(value)
+        checked[name] = tuple(map(float, elements)) if value_type is tuple else value_type(value)
     missing_names = [name for name in required if name not in row]
     if missing_names:
         raise InvalidPatchError(f"{where} lacks {', '.join(missing_names)}.")

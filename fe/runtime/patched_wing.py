@@ -73,14 +73,16 @@ def solver_by_inverse(stiffness: FloatArray) -> Solver:
 
 
 def motion_basis(
-    static: Solver, mass: FloatArray, start: FloatArray, static_shapes: FloatArray
+    solve_stiffness: Solver, mass: FloatArray, start: FloatArray, static_shapes: FloatArray
 ) -> FloatArray:
     """Return an orthonormal basis of the lowest modes, by subspace iteration, and static shapes.
 
+    Columns are orthonormal in the Euclidean inner product, without the mass matrix.
+
     Parameters
     ----------
-    static : callable
-        K^-1 of loads (n, k).
+    solve_stiffness : callable
+        Returns the displacements K^-1 f under loads f (n, k).
     mass : (n, n) array
         The mass matrix M [kg].
     start : (n, r) array
@@ -95,7 +97,7 @@ def motion_basis(
     """
     basis = start
     for _ in range(ITERATIONS):
-        basis = np.linalg.qr(static(mass @ basis))[0]
+        basis = np.linalg.qr(solve_stiffness(mass @ basis))[0]
     for shape in (static_shapes / np.linalg.norm(static_shapes, axis=0)).T:
         # Gram-Schmidt in two passes: the first leaves rounding errors in the basis' directions,
         # which matter if the remainder is small

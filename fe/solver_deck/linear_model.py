@@ -164,7 +164,13 @@ class LinearModel:
         free: bool = False,
         preloaded: bool = False,
     ) -> str:
-        """Return the deck of this model with the given steps.
+        """Return the text of the deck of this model with the given steps.
+
+        The deck has one of three kinds of supports:
+
+        - with `preloaded`, those of the preload, whose steps come first (if the model has one);
+        - otherwise, with `free`, none but the held rotations;
+        - otherwise all held motions.
 
         Parameters
         ----------
@@ -173,20 +179,20 @@ class LinearModel:
         blocks : sequence of KeywordBlock, optional
             Blocks of the model in place of its own.
         free : bool
-            Whether the nodes can move along all axes; rotations stay held.
+            Whether the supports release all translations. It has no effect after a preload.
         preloaded : bool
-            Whether the steps follow the preload, if the model has one.
+            Whether the given steps are small changes from the end of the preload.
         """
         lines = []
         for block in self.blocks if blocks is None else blocks:
             lines += block_lines(block)
         if preloaded and self.preload:
             return "\n".join([*lines, *self._preloaded_lines(steps)]) + "\n"
-        directions = ROTATIONS if free else (*TRANSLATIONS, *ROTATIONS)
+        held_directions = ROTATIONS if free else (*TRANSLATIONS, *ROTATIONS)
         supports = [
             f"{motion.node},{motion.direction}"
             for motion in self.held
-            if motion.direction in directions
+            if motion.direction in held_directions
         ]
         if supports:
             lines += ["*BOUNDARY", *supports]
@@ -303,9 +309,9 @@ def _unloaded_blocks(
 
 def _preload_steps(steps: list[list[KeywordBlock]]) -> list[list[KeywordBlock]]:
     """Return the static steps before the first with PERTURBATION, without their output."""
-    for number, step in enumerate(steps):
+    for step_index, step in enumerate(steps):
         if "PERTURBATION" in step[0].parameters:
-            earlier = steps[:number]
+            earlier = steps[:step_index]
             static = [step for step in earlier if any(b.keyword == "STATIC" for b in step)]
             return [[block for block in step if block.keyword not in _OUTPUT] for step in static]
     return []
@@ -366,13 +372,13 @@ def _split_steps(
     return before_steps, steps
 
 
-def _tie(pair: KeywordBlock, number: int) -> KeywordBlock:
-    """Return the *TIE that replaces a *CONTACT PAIR."""
-    parameters = {"NAME": f"UAVPAIR{number}"}
-    if "ADJUST" in pair.parameters:
+def _tie(contact_pair: KeywordBlock, tie_number: int) -> KeywordBlock:
+    """Return the *TIE that replaces a *CONTACT PAIR; `tie_number` makes its name unique."""
+    parameters = {"NAME": f"UAVPAIR{tie_number}"}
+    if "ADJUST" in contact_pair.parameters:
         parameters["ADJUST"] = "NO"
-    slave_and_master = [DataLine(where, values[:2]) for where, values in pair.data]
-    return KeywordBlock(pair.where, "TIE", parameters, slave_and_master)
+    slave_and_master = [DataLine(where, values[:2]) for where, values in contact_pair.data]
+    return KeywordBlock(contact_pair.where, "TIE", parameters, slave_and_master)
 
 
 def _supports(

@@ -387,7 +387,8 @@ class AffineResponse:
 def static_responses(structure: AffineStructure) -> dict[str, AffineResponse]:
     """Solve the undamaged structure for each load alone.
 
-    The control of each load has the value `control_value_alone`.
+    A load is proportional to its control. The control has its nominal value, or one if the load is
+    constant or would vanish at the nominal value (`control_value_alone`).
 
     Returns
     -------

@@ -90,7 +90,7 @@ def assemble_matrices(
     unknowns = _Unknowns(sparse.eye_array(len(files.dofs), format="csc")[:, free_rows].tocsr())
     if yielding:
         unknowns = _with_held_motions(design, files, unknowns)
-    fields = _fields(design, files, mass, unknowns)
+    fields = _affine_fields_of_matrices(design, files, mass, unknowns)
     # The expansion of the model gives displacements of nodes, not the rows of the matrices.
     fields["expansion"] = (_nodal_displacements(files) @ unknowns.expansion).tocsr()
     return MatrixStructure(
@@ -123,19 +123,22 @@ class _Unknowns(NamedTuple):
 
 
 def _with_held_motions(design: MatrixDesign, files: MatrixFiles, unknowns: _Unknowns) -> _Unknowns:
-    """Append the motions that the supports hold to the unknowns, as if the supports were free."""
+    """Append the motions that the supports hold to the unknowns, as if the supports were free.
+
+    Each motion is a column (R,): the rows of the matrices that move with it have the value 1.
+    """
     columns: dict[tuple[str, str], FloatArray] = {}
     for label, support in design.numbered("support"):
-        numbers = sorted(support.nodes)
-        name = f"node {numbers[0]}" if len(numbers) == 1 else f"nodes {numbers[0]} to {numbers[-1]}"
+        nodes = sorted(support.nodes)
+        name = f"node {nodes[0]}" if len(nodes) == 1 else f"nodes {nodes[0]} to {nodes[-1]}"
         for motion in support.hold:
             component = MOTIONS.index(motion) + 1
             column = columns.setdefault((name, motion), np.zeros(len(files.dofs)))
             for node in support.nodes:
                 column[files.rows_of((node, component), label)] = 1.0
     motions = tuple(
-        SupportMotion(name, motion, unknowns.free_count + number, 0.0)
-        for number, (name, motion) in enumerate(columns)
+        SupportMotion(name, motion, unknowns.free_count + index, 0.0)
+        for index, (name, motion) in enumerate(columns)
     )
     # a rotation is multiplied by the unit of length, because all unknowns are lengths
     blocks = [
@@ -175,11 +178,15 @@ def _free_rows(design: MatrixDesign, files: MatrixFiles, can_move: FloatArray) -
     return np.flatnonzero(is_free)
 
 
-def _fields(
+def _affine_fields_of_matrices(
     design: MatrixDesign, files: MatrixFiles, mass: sparse.csr_array, unknowns: _Unknowns
 ) -> AffineFields:
-    """Return the fields of the affine model, whose expansion leads to the rows of the matrices."""
+    """Return the fields of the affine model of matrices, but the stiffness terms.
+
+    Their expansion (R, n) maps the n unknowns to the R rows of the matrices.
+    """
     row_count = len(files.dofs)
+    # `label` names a row of the design in messages, such as `load[1]`
     point_masses = (_point_mass(part, files, label) for label, part in design.numbered("mass"))
     loads = (_load(load, files, label) for label, load in design.numbered("load"))
 
@@ -255,10 +262,10 @@ def _nodal_displacements(files: MatrixFiles) -> sparse.csr_array:
     """
     nodes = sorted({node for node, _ in files.dofs})
     displacements = sparse.lil_array((3 * len(nodes), len(files.dofs)))
-    for number, dof in enumerate(itertools.product(nodes, (1, 2, 3))):
+    for component_index, dof in enumerate(itertools.product(nodes, (1, 2, 3))):
         rows = files.rows.get(dof, [])
         if len(rows) in READ_WEIGHTS:
-            displacements[number, rows] = READ_WEIGHTS[len(rows)]
+            displacements[component_index, rows] = READ_WEIGHTS[len(rows)]
     return displacements.tocsr()
 
 

@@ -58,14 +58,15 @@ def read_histories(path: Path, binding: Binding) -> tuple[int, InputHistories]:
     table = read_table(path, TableErrors(FmuInputError, FmuInputError))
     time = table.numbers(_TIME, "a simulation")
     _check_times(time, path, binding)
-    known_names = _names_of_columns(binding)
+    inputs_by_column_name = _inputs_by_column_name(binding)
     columns_of_input: dict[_InputName, dict[int, Float]] = {}
     for column in table.columns:
         if column == _TIME:
             continue
-        input_name, number = _column_meaning(column, known_names)
+        input_name, number = _column_meaning(column, inputs_by_column_name)
         if input_name is None:
-            full_names = [name.full for name in dict.fromkeys(known_names.values())]
+            # an input may have two names: without and with its role
+            full_names = [name.full for name in dict.fromkeys(inputs_by_column_name.values())]
             raise FmuInputError(
                 f"The column {column!r} of {path} is not an input of the binding {binding.name}; "
                 f"it has {comma_list(full_names)}."
@@ -98,10 +99,12 @@ def _check_times(time: Float, path: Path, binding: Binding) -> None:
         )
 
 
-def _names_of_columns(binding: Binding) -> dict[str, _InputName]:
-    """Return the inputs of a binding by the names that their columns may have.
+def _inputs_by_column_name(binding: Binding) -> dict[str, _InputName]:
+    """Map each accepted name of a column to its input of the binding.
 
-    A name without a role is accepted if only one role has an input of this name.
+    A column has the name of its input with the role, such as `control.load_factor` or
+    `port.spring.force`. The name alone, such as `load_factor`, is accepted too if only one role has
+    an input of this name.
     """
     inputs = []
     for role in INPUT_ROLES:

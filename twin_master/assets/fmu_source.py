@@ -422,8 +422,8 @@ class FmuSource(AssetSource):
     def _observation_slice(self, binding: Binding, role: str = "") -> slice:
         """Return the positions of an observed quantity among the observed values of the binding.
 
-        `role` is the name of the quantity in the binding; if it is empty, the scenario names it.
-        The number and the units of its values must be those of the scenario.
+        `role` is the name of the quantity in the binding; by default, the one that the scenario
+        observes. It must have as many values as the scenario expects, in the same units.
         """
         observation = self._scenario.observation
         role = role or observation.role
@@ -436,7 +436,10 @@ class FmuSource(AssetSource):
         return positions
 
     def _slice_of_role(self, binding: Binding, role: str) -> slice:
-        """Return the positions of the values of a role, whose number must be the scenario's."""
+        """Return the positions of a role's values; raise an error if the scenario expects others.
+
+        The scenario states how many values an observation has.
+        """
         expected_count = self._scenario.observation.count
         positions = binding.observation_slice(role)
         count = positions.stop - positions.start
@@ -450,11 +453,15 @@ class FmuSource(AssetSource):
     def _find_truth_outputs(self, binding: Binding) -> TruthOutputs | None:
         """Return the outputs that report the true state; None if the scenario states it itself.
 
+        The true state happens inside the asset if `truth.kind` is "asset". Then `truth.state` names
+        the monitor of the true value of each state factor, `truth.observation` the readings without
+        noise, and `truth.received` the values that are 0 for a lost reading.
+
         Raises
         ------
         MissionInputError
-            If the binding lacks a monitor or observation that `truth` names, or the twin is to
-            believe the asset.
+            If the binding lacks a monitor or observation that `truth` names, or the twin uses the
+            asset itself as its model.
         """
         truth = self._scenario.truth
         if truth.kind != "asset":
@@ -464,12 +471,17 @@ class FmuSource(AssetSource):
                 "an asset with damage of its own cannot predict the observations of each state: "
                 "name a model for the twin in the table `belief`."
             )
-        names_by_sort = [("monitor", truth.state.values(), binding.monitor)]
-        check_names("`truth.state` names the", f"the binding {binding.name}", names_by_sort)
+        names_by_kind = [("monitor", truth.state.values(), binding.monitor)]
+        check_names(
+            owner="`truth.state` names the",
+            reference=f"the binding {binding.name}",
+            rows=names_by_kind,
+        )
         received_positions = None
         if truth.received is not None:
             received_positions = self._slice_of_role(binding, truth.received)
-        observation = self._observation_slice(binding, truth.observation or "")
+        # without a name of its own, the true observation has that of the scenario's observation
+        observation = self._observation_slice(binding, role=truth.observation or "")
         return TruthOutputs(truth.state, observation, received_positions)
 
     def parameters(self) -> dict[str, float]:

@@ -272,8 +272,8 @@ def check_calibration(
     if record is None or record.design is not None:
         return
     names = {prior.name for prior in record.priors}
-    names_by_sort = [("parameter", names, known_names)]
-    check_names(f"the calibration of {record.asset} has the", where, names_by_sort, advice=advice)
+    names_by_kind = [("parameter", names, known_names)]
+    check_names(f"the calibration of {record.asset} has the", where, names_by_kind, advice=advice)
     if design_hash and record.design_hash not in ("", design_hash):
         raise MissionInputError(
             f"the calibration of {record.asset} is of the model {record.model} with the design "

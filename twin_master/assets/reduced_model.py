@@ -203,9 +203,9 @@ class StructureOfFile(AssetSource):
                 f"a structure gives its first {most} modes, but mode {highest} is observed."
             )
         accelerometers = [acceleration.name for acceleration in self.design.acceleration]
-        names_by_sort = [("accelerometer", modes.accelerometers, accelerometers)]
+        names_by_kind = [("accelerometer", modes.accelerometers, accelerometers)]
         advice = self.advice.state or "give it in a table [[acceleration]]"
-        check_names("the scenario has the", self.full_name, names_by_sort, advice=advice)
+        check_names("the scenario has the", self.full_name, names_by_kind, advice=advice)
 
     def _check_observed_sensors(self) -> None:
         """Refuse sensors whose role, unit, number or titles do not fit the structure."""
@@ -353,12 +353,12 @@ class ReducedModelSource(StructureOfFile):
         self._check_parameter(believed=True)
         damage_names = [damage.name for damage in design.damage]
         control_names = [control.name for control in design.control]
-        names_by_sort = (
+        names_by_kind = (
             ("state", scenario.state_names, damage_names),
             ("control input", scenario.control[0].values, control_names),
         )
         advice = self.advice.state
-        check_names("the scenario has the", self.full_name, names_by_sort, advice=advice)
+        check_names("the scenario has the", self.full_name, names_by_kind, advice=advice)
         self._check_observed()
         self._check_ranges({})
         self.check_model()

@@ -267,7 +267,8 @@ class StreamNotices:
     def report_refusals(self, next_step: int) -> Notice:
         """Return the notice that all messages since the last step were refused.
 
-        After it, no such notice is due until a message is accepted again.
+        This marks the refusals as reported, so that the notice is not repeated until a message has
+        been accepted again.
 
         Parameters
         ----------

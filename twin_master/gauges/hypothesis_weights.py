@@ -133,7 +133,7 @@ class HypothesisWeights:
         Returns
         -------
         (B, 1 + G K) array
-            By how much the probability rises that a fault is there and hidden, for each fault.
+            The increase of p(fault, hidden) for each fault; 0 where it decreases.
         """
         newly_hidden = np.zeros_like(self.hidden)
         pairs = np.stack([previous_control, control], axis=1)
@@ -151,11 +151,16 @@ class HypothesisWeights:
         return newly_hidden
 
     def change_control(self, previous_control: int, control: int) -> Float:
-        """Divide the probability of each fault anew into its showing and its hidden part.
+        """Split the probability of each fault into a visible and a hidden part for a new control.
 
-        A fault may show in the readings under one control and be hidden under another. The present
-        division is kept in `showing` of the previous control; that of the new control is taken from
-        `showing`, and sets `current` and `hidden`. The probability of the fault stays the same.
+        A fault may be visible in the readings under one control and hidden under another. Its total
+        probability does not change with the control:
+
+            p(fault) = p(fault, visible) + p(fault, hidden).
+
+        The logarithms of the two parts are in `current` and `hidden`. `showing` has the conditional
+        probability p(visible | fault) under each control. First it is updated for the previous
+        control from the two parts. Then the two parts are set by its value for the new control.
 
         Parameters
         ----------
@@ -165,20 +170,18 @@ class HypothesisWeights:
         Returns
         -------
         (..., 1 + G K) array
-            By how much the probability rises that a fault is there and hidden, for each fault in
-            the order of `hidden`; 0 where it falls.
+            The increase of p(fault, hidden) for free gains, then for each of K gain errors of each
+            of G gauges; 0 where it decreases.
         """
-        # joint log probabilities: of the fault and that it shows, and of the fault
-        log_fault_and_showing = self.current[..., FAULTS]
-        log_fault = np.logaddexp(log_fault_and_showing, self.hidden)
-        hidden_before = np.exp(self.hidden)
-        # `showing` is conditional: p(showing | fault)
-        showing_if_fault = np.exp(log_fault_and_showing - log_fault)
-        self.showing[..., previous_control] = np.clip(showing_if_fault, LEAST_SHOWING, 1.0)
+        log_fault_and_visible = self.current[..., FAULTS]
+        log_fault = np.logaddexp(log_fault_and_visible, self.hidden)
+        previous_hidden = np.exp(self.hidden)
+        p_visible_given_fault = np.exp(log_fault_and_visible - log_fault)
+        self.showing[..., previous_control] = np.clip(p_visible_given_fault, LEAST_SHOWING, 1.0)
         self.current[..., FAULTS] = log_fault + np.log(self.showing[..., control])
-        with np.errstate(divide="ignore"):  # a fault that certainly shows is not hidden
+        with np.errstate(divide="ignore"):  # a fault that is certainly visible is not hidden
             self.hidden = log_fault + np.log1p(-self.showing[..., control])
-        return np.asarray(np.maximum(np.exp(self.hidden) - hidden_before, 0.0))
+        return np.asarray(np.maximum(np.exp(self.hidden) - previous_hidden, 0.0))
 
     def advance(self, log_hazard: float | Float, log_begin: Float) -> Float:
         """Let faults begin and end in a step: one transition of the weights, in place.
@@ -196,14 +199,14 @@ class HypothesisWeights:
             The probability of each fault that it has ended in the step.
         """
         probability = np.exp(self.current)
-        hidden = np.exp(self.hidden)
+        hidden_probability = np.exp(self.hidden)
         hazard = np.exp(np.asarray(log_hazard))
         ended = END_PROBABILITY * probability[..., FAULTS]
 
         # A new fault begins from the model. If the gauges are right again after a fault, only free
         # gains may begin: the beliefs of single gauges have not followed what happened since.
         free_gains_begin = hazard * np.exp(log_begin[FREE_GAINS])
-        right_after_fault = probability[..., RECOVERED] + hidden.sum(axis=-1)
+        right_after_fault = probability[..., RECOVERED] + hidden_probability.sum(axis=-1)
         begun = (probability[..., MODEL] * hazard)[..., None] * np.exp(log_begin[FAULTS])
         begun[..., FREE_GAINS_OF_FAULTS] += right_after_fault * free_gains_begin
 
@@ -220,8 +223,10 @@ class HypothesisWeights:
 
         # Nothing is known about a fault that began in this step under the other controls: it shows
         # there with the prior probability.
-        hidden *= (1.0 - free_gains_begin)[..., None]
-        fault_probability = np.maximum(advanced[..., FAULTS] + hidden, _LEAST_PROBABILITY)
+        hidden_probability *= (1.0 - free_gains_begin)[..., None]
+        fault_probability = np.maximum(
+            advanced[..., FAULTS] + hidden_probability, _LEAST_PROBABILITY
+        )
         self.showing += (begun / fault_probability)[..., None] * (SHOWS_ELSEWHERE - self.showing)
         return np.asarray(ended)
 

@@ -97,45 +97,54 @@ def pairs_of_hypotheses(beliefs: Beliefs, twin: int, fault_pairs: Index) -> Inde
 @compiled
 def model_likelihood(
     observation: StandardizedObservation,
-    pair: Index,
+    pair_indices: Index,
     scale_squares: Float,
     density: Float,
     log_factor: float,
 ) -> ModelLikelihood:
     """Return the density of an observation under the model at some pairs, relative to the largest.
 
+    A pair is a state and a draw of the parameter. The function is compiled, hence the loops.
+
     Parameters
     ----------
-    pair : (n,) array
-        The indices of the pairs.
+    pair_indices : (n,) array
+        The indices of n of the N pairs.
     scale_squares : (G,) array
-        Degrees of freedom plus the expected sum of squared residuals before the observation.
+        What divides the squared residual of each of G gauges in Student's density: the degrees of
+        freedom plus the expected sum of squared residuals before the observation.
     density : (N,) array
         The density at all pairs under the model, divided by a factor.
     log_factor : float
-        The log of that factor, up to a constant of the step.
+        The log of that factor, plus a constant that is the same for all pairs and hypotheses of the
+        step.
     """
-    count = len(pair)
-    relative_density = np.empty(count)
+    count = len(pair_indices)
+    relative_density = np.empty(count)  # to the factor at first, at the end to the largest density
     largest = 0.0
     is_finite = True
     for j in range(count):
-        relative_density[j] = density[pair[j]]
+        relative_density[j] = density[pair_indices[j]]
         largest = max(largest, relative_density[j])
         is_finite &= relative_density[j] < np.inf
     if not is_finite or largest < LEAST_TOTAL:  # overflow or underflow: compute by logarithms
-        log_density_of_sound_gauges(observation, pair, scale_squares, relative_density)
+        log_density = np.empty(count)
+        log_density_of_sound_gauges(observation, pair_indices, scale_squares, log_density)  # fills
         log_factor = -np.inf
         for j in range(count):
-            log_factor = max(log_factor, relative_density[j])
+            log_factor = max(log_factor, log_density[j])
         largest = 1.0
         for j in range(count):
-            relative_density[j] = np.exp(relative_density[j] - log_factor)
+            relative_density[j] = np.exp(log_density[j] - log_factor)
     reference = 0
     for j in range(count):
         relative_density[j] /= largest
         if relative_density[j] > relative_density[reference]:
             reference = j
     return ModelLikelihood(
-        pair, scale_squares, relative_density, log_factor + np.log(largest), pair[reference]
+        pair_indices,
+        scale_squares,
+        relative_density,
+        log_factor + np.log(largest),
+        pair_indices[reference],
     )

@@ -199,13 +199,13 @@ def _check_grid(grid: SamplingGrid, binding: Binding) -> None:
     if grid.parameter:
         parameter_names.append(grid.parameter)
     control_inputs = next(iter(grid.controls.values()), {})
-    names_by_sort = (
+    names_by_kind = (
         ("state", grid.states, binding.health),
         ("control input", control_inputs, binding.control),
         ("load", grid.load, binding.load),
         ("parameter", parameter_names, binding.parameter),
     )
-    check_names("the grid has the", f"the binding {binding.name}", names_by_sort)
+    check_names("the grid has the", f"the binding {binding.name}", names_by_kind)
     binding.observation_slice(grid.role)  # raises an error for an unknown role
     if not grid.states or not grid.controls or not grid.draws:
         raise MissionInputError(

@@ -27,7 +27,8 @@ from twin_master.network.planner import BeliefPolicy, Hold, RiskPolicy
 from twin_master.network.transition import TransitionModel, checked_beliefs, checked_controls
 
 LARGEST_CARRIED = np.float64(1e150)
-"""Upper bound of carried numbers: their squares are still finite."""
+"""Upper bound of the numbers of an estimate and of those that it carries to the next step: their
+squares are still finite."""
 Planner = Callable[[GraphicalModel], ArrayLike]
 """Returns the policy p(U | D), (S, U), for states, controls and transitions."""
 DecisionBasis = Literal["filtered", "predicted"]
@@ -379,15 +380,19 @@ class Twin:
     def _assimilate_from(self, first_step: int, rows: Sequence[tuple[Float, int]]) -> TwinStep:
         """Filter the observations of consecutive steps, and decide on the next control.
 
+        With a `Hold`, a harder control is taken only after it was proposed in several steps in a
+        row; `proposals` counts them.
+
         Parameters
         ----------
         first_step : int
             The step of the first observation; it and later steps are replaced.
         rows : sequence of (G,) array and int
-            The observation and the control in force of each step.
+            The observation and the control in force of each step; at least one step.
         """
         kept_count_before = first_step - self._first_in_memory
         step_before = self._kept_steps[kept_count_before - 1] if kept_count_before else None
+        # what the estimator carries from step to step
         previous_carried = step_before.carried if step_before else None
         proposals = step_before.proposals if step_before else 0
         new_steps: list[_KeptStep] = []
@@ -406,7 +411,7 @@ class Twin:
                 estimate.filtered,
                 *previous_carried.arrays.values(),
             )
-            # False for NaN as well.
+            # the comparison is also False for NaN
             if not all(np.all(np.asarray(values) < LARGEST_CARRIED) for values in checked_values):
                 raise unbelievable_observation(self.name, step)
             proposals_before = proposals

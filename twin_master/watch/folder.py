@@ -248,12 +248,13 @@ class Watch:
     def begin(self, feed: Feed, patch: GivenPatch | None = None) -> Iterator[None]:
         """Open the journal, and restore the twin and the intake to their state at its last line.
 
-        At the end of this context the counts of the messages are written.
+        The intake takes messages from the feed. At the end of this context the counts of the
+        messages are written; after an exception they are not.
 
         Parameters
         ----------
         feed : Feed
-            The messages to watch; `Intake.restore` says from which one on they are read.
+            The messages to watch; `Intake.restore` says where reading resumes.
         patch : GivenPatch, optional
             A patch to adopt before the first step.
         """
@@ -261,6 +262,7 @@ class Watch:
         intake.stops_at_refusals = True
         flush_seconds = FLUSH_SECONDS if feed.replayable else 0.0
         with JournalFile(self.folder, self._config_hash, flush_seconds) as self.journal:
+            # adopted models first: `replay` computes the steps of the journal with them
             self.update_from_journal()
             history, last_line = replay(self.journal_path, self.models, self.scenario.watch.lag)
             self.twin = history.twin
@@ -273,6 +275,7 @@ class Watch:
             self.is_quiet = "quiet" in last_line
             self._time_of_last_step = time.monotonic()
             self._written_intake = intake.state()
+            # now that all is restored, other threads may read it (metrics) and a patch be adopted
             self.has_begun = True
             if patch is not None:
                 self._adopt_given(patch)

@@ -137,12 +137,12 @@ def _create_coordinates(
 
 
 def _write_names(zarr_group: "zarr.Group", group: Group, partition: _Partition) -> None:
-    """Write the names of the twins of a group, the rows of one file at a time.
+    """Write the names of the twins of a group, the rows of one file (shard) at a time.
 
-    The groups inside it inherit this coordinate.
+    Subgroups inherit this coordinate.
     """
     twin_count = len(group.members)
-    label = twin_coordinate([])
+    coordinate_attributes = dict(twin_coordinate([]).attrs)
     array = zarr_group.create_array(
         TWIN_AXIS,
         shape=(twin_count,),
@@ -150,7 +150,7 @@ def _write_names(zarr_group: "zarr.Group", group: Group, partition: _Partition) 
         shards=(partition.file_rows,),
         dtype="str",
         dimension_names=(TWIN_AXIS,),
-        attributes=dict(label.attrs),
+        attributes=coordinate_attributes,
         overwrite=True,
     )
     for first_row in range(0, twin_count, partition.file_rows):
@@ -290,12 +290,12 @@ class GroupWriter:
             if self._address.remote and file.path.is_file():
                 self._address.send(file.path, self._path_in_store(path, number))
 
-    def _file(self, path: str, number: int) -> ChunkFile:
-        """Return a file of a variable."""
+    def _file(self, path: str, file_number: int) -> ChunkFile:
+        """Return the file with a number of the variable at a path."""
         folder = self._address.folder / (_GROWING if self._address.remote else STORE_NAME)
-        file = folder / self._path_in_store(path, number)
+        file = folder / self._path_in_store(path, file_number)
         return ChunkFile(file, self._partition.chunks_per_file)
 
-    def _path_in_store(self, path: str, number: int) -> str:
-        """Return the path in the store of a file of a variable."""
-        return f"{self._group.name}/{path}/{chunk_key(number, self._axis_counts[path])}"
+    def _path_in_store(self, path: str, file_number: int) -> str:
+        """Return the path, in the store, of the file with a number of the variable at a path."""
+        return f"{self._group.name}/{path}/{chunk_key(file_number, self._axis_counts[path])}"
