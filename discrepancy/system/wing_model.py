@@ -172,12 +172,13 @@ class WingModel(SystemModel):
     def supports(self, primitive: type[Primitive]) -> bool:
         """Return whether the wing can carry a primitive: any but those that need what it lacks.
 
-        It has no forces by a formula in time, no named places for masses, and neither loads nor
-        gauges that may be moved from their places.
+        It has no forces by a formula in time, no named places for masses, no interfaces of parts,
+        and neither loads nor gauges that may be moved from their places.
         """
         not_carried = (
             changes.PortLoad,
             changes.PlaceMass,
+            changes.InterfaceCompliance,
             changes.LoadOffset,
             changes.LoadTilt,
             changes.GaugeOffset,

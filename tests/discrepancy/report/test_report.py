@@ -260,7 +260,7 @@ def test_an_effect_is_not_the_nearest_to_itself(drag, count):
     (told,) = (
         line
         for line in campaign_needs(
-            Separability(hidden, (), np.zeros((0, 0)), ()), drag.campaign, FEW, TrialKind
+            Separability(hidden, (), np.zeros((0, 0)), (), ()), drag.campaign, FEW, TrialKind
         )
         if "would not be detectable" in line
     )
