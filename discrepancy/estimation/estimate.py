@@ -1,6 +1,6 @@
 """A hypothesis at its most probable values: effects, motion, missing forces and evidence."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -76,18 +76,6 @@ class Estimate:
     def ported_trials(self) -> tuple[LinearTrial, ...]:
         """The linear trials with ports, in which the estimate was made."""
         return tuple(smoothed_trial.trial for smoothed_trial in self.trials)
-
-    @property
-    def in_motion(self) -> "Estimate":
-        """The estimate with its trials in motion alone."""
-        linear_trials = self.linearisation.in_motion
-        if len(linear_trials) == len(self.trials):
-            return self
-        return replace(
-            self,
-            trials=tuple(trial for trial in self.trials if not trial.trial.is_at_rest),
-            linearisation=replace(self.linearisation, trials=linear_trials),
-        )
 
     @property
     def local(self) -> tuple[FloatArray, ...]:

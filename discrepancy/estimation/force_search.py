@@ -353,7 +353,7 @@ class ForceSearch:
             start_in_other_trials(self.estimate_without_effects, trials),
             effect=point.effect,
             shared=point.shared,
-            local=point.local,
+            local=tuple(point.local[index] for index in self.ported.trial_indices),
             processes=estimator.small_processes,
         )
         return estimator.follow_laws(self.ported.laws(candidate, trials), start)

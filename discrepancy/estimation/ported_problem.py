@@ -8,9 +8,10 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
-from discrepancy.campaign.records import FloatArray, TrialKind
+from discrepancy.campaign.records import FloatArray, Trial, TrialKind
 from discrepancy.fits.candidate import PARAMETER_STEP, Candidate, Point, with_step
 from discrepancy.fits.problem import Problem
+from discrepancy.system.interface import Model
 from discrepancy.trials_in_motion.effects import HALF_DIFFERENCE, EffectLaws
 from discrepancy.trials_in_motion.trajectory import Trajectory
 from discrepancy.trials_in_motion.trial_at_rest import LinearTrial
@@ -32,11 +33,26 @@ motion, see `LawArguments`."""
 def can_estimate_forces(problem: Problem) -> bool:
     """Return whether missing forces can be estimated in a problem.
 
-    That needs a model that describes how its ports move, and trials other than missions.
+    That needs a model that describes how its ports move, and a trial that shows the forces.
     """
     model = problem.model
-    has_missions = any(data.trial.kind is TrialKind.FLIGHT for data in problem.trials)
-    return model.shows_ports and bool(model.ports) and not has_missions
+    shows_a_force = any(shows_missing_force(model, data.trial) for data in problem.trials)
+    return model.shows_ports and bool(model.ports) and shows_a_force
+
+
+def shows_missing_force(model: Model, trial: Trial) -> bool:
+    """Return whether missing forces are estimated in a trial.
+
+    They are in all trials in motion. At rest they are in load steps, but not in missions, nor if
+
+    - the model does not tell how a force at a port acts at rest, as an FMU does not;
+    - the model has a mesh: masses and losses of stiffness then have many places, which are searched
+      on grids that refit the errors of the mesh at each of them.
+    """
+    if trial.is_dynamic:
+        return True
+    has_load_steps = trial.kind is TrialKind.STATIC
+    return has_load_steps and model.shows_ports_at_rest and not model.nuisance_parameters
 
 
 class PortedProblem:
@@ -45,7 +61,7 @@ class PortedProblem:
     Parameters
     ----------
     problem : Problem
-        A problem with trials in motion, whose model has ports.
+        A problem in which missing forces can be estimated, see `can_estimate_forces`.
     sample_limit : int, optional
         The number of samples of all trials together to which trials are thinned, if they can be.
 
@@ -59,8 +75,10 @@ class PortedProblem:
         The model's own laws at its ports, which its linear system does not contain.
     prior_means : Point
         The prior means of all unknowns, about which the trials are linear at first.
+    trial_indices : list of int
+        The indices in the problem of the trials that show missing forces.
     trial_set : TrialSet
-        The trials, from which linear trials with ports are made.
+        These trials, from which linear trials with ports are made.
     shared_priors : Priors
         The priors of the unknowns that all trials share.
     """
@@ -71,11 +89,14 @@ class PortedProblem:
         trials = tuple(data.trial for data in problem.trials)
         self.model = problem.model
         self.problem = problem.with_trials(trials, linear_model)
+        self.trial_indices = [
+            index for index, trial in enumerate(trials) if shows_missing_force(self.model, trial)
+        ]
         self.ports = tuple(linear_model.ports)
         self.prior_means = self.problem.prior_mean_point(NO_EFFECTS)
         self.trial_set = TrialSet(
             problem=self.problem,
-            trial_indices=range(len(problem.trials)),
+            trial_indices=self.trial_indices,
             evaluate_model_laws=self.evaluate_model_laws,
             unknowns_of_model_laws=self._unknowns_of_model_laws(self.prior_means.shared),
             sample_limit=sample_limit,
@@ -90,6 +111,11 @@ class PortedProblem:
         Free forces at more ports than that fit any reading, whatever law acts at one of them.
         """
         return all(len(data.trial.channels) >= len(self.ports) for data in self.problem.trials)
+
+    @property
+    def has_all_trials(self) -> bool:
+        """Whether all trials of the problem show missing forces, so that none is left out."""
+        return len(self.trial_indices) == len(self.problem.trials)
 
     def linearise(
         self,
@@ -172,13 +198,16 @@ class PortedProblem:
         shared_values : (K,) array
             The scaled values of the K unknowns that all trials share.
         local_of_trials : iterable of (L,) array
-            The unknowns of each trial alone.
+            The unknowns of each trial that shows missing forces; those of others are zero.
         """
+        local_values = [np.zeros(data.unknowns.unknown_count) for data in self.problem.trials]
+        for trial_index, values in zip(self.trial_indices, local_of_trials, strict=True):
+            local_values[trial_index] = values
         low, high = self.problem.shared.bounds
         # a margin of one step, so that difference quotients stay in the ranges
         low = np.maximum(low + PARAMETER_STEP, -2.0)
         high = np.minimum(high - PARAMETER_STEP, 2.0)
-        return Point(np.clip(shared_values, low, high), tuple(local_of_trials), np.zeros(0))
+        return Point(np.clip(shared_values, low, high), tuple(local_values), np.zeros(0))
 
     def point_of(self, estimate: Estimate) -> Point:
         """Return `point_of_unknowns` of an estimate, without its effects."""

@@ -24,7 +24,7 @@ from .gauss_newton import EstimatorStart, start_from_estimate
 
 @dataclass(frozen=True, eq=False)
 class TrialSet:
-    """Some trials in motion of a problem, from which linear systems with ports and laws are made.
+    """Some trials of a problem, from which linear trials with ports and laws are made.
 
     Attributes
     ----------

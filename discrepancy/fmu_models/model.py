@@ -74,6 +74,7 @@ class FmuModel(DescribedModel):
     """
 
     holds_inputs: ClassVar[bool] = True
+    shows_ports_at_rest: ClassVar[bool] = False
 
     def __init__(self, description: FmuModelDescription, folder: Path | str = ".") -> None:
         self.description: FmuModelDescription = description

@@ -297,7 +297,8 @@ def _forces_by_trial(
     """
     trial_forces = []
     # the few load steps at rest tell little beside records in motion
-    for smoothed_trial in estimate.in_motion.trials or estimate.trials:
+    in_motion = [trial for trial in estimate.trials if not trial.trial.is_at_rest]
+    for smoothed_trial in in_motion or estimate.trials:
         trial = smoothed_trial.trial
         samples = slice(None, None, trial.substeps)
         law_force = smoothed_trial.effect_forces[port][samples] if has_law else None

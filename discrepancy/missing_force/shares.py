@@ -17,7 +17,7 @@ from discrepancy.estimation.gauss_newton import (
     linearise_trials,
 )
 from discrepancy.estimation.linearisation import Linearisation, plain_linearisation
-from discrepancy.estimation.ported_problem import WIDE_WINDOW
+from discrepancy.estimation.ported_problem import WIDE_WINDOW, shows_missing_force
 from discrepancy.estimation.process_search import Processes
 from discrepancy.estimation.trial_set import TrialSet
 from discrepancy.fits.candidate import Point
@@ -63,7 +63,9 @@ class ForceShares:
     def __init__(self, search: ForceSearch) -> None:
         self.search = search
         campaign = search.ported.problem.campaign
-        held_out = tuple(campaign.held_out)
+        held_out = tuple(
+            trial for trial in campaign.held_out if shows_missing_force(search.ported.model, trial)
+        )
         self._held_out: TrialSet | None = None
         self._held_out_trials: dict[bytes, tuple[LinearTrial, ...]] = {}
         self._without_effect: dict[bool, tuple[SmoothedTrial, ...]] = {}
@@ -75,7 +77,7 @@ class ForceShares:
 
     @property
     def has_held_out(self) -> bool:
-        """Whether some of the trials are held out."""
+        """Whether some of the held-out trials show missing forces."""
         return self._held_out is not None
 
     def gap_share(self, estimate: Estimate, *, held_out: bool) -> GapShare:

@@ -29,10 +29,10 @@ def search(
 ) -> Search:
     """Search the catalogue for the set of effects that explains a campaign.
 
-    The model without effect is fitted first. If the model has ports, and each trial at least as
-    many channels, sets of effects are compared by the force that they leave missing. Otherwise, in
-    missions, at rest on a mesh, or if that force cannot be estimated, single effects are fitted to
-    the readings, then sets.
+    The model without effect is fitted first. If all trials show missing forces (see
+    `shows_missing_force`), each with at least as many channels as the model has ports, sets of
+    effects are compared by the force that they leave missing. Otherwise, or if that force cannot be
+    estimated, single effects are fitted to the readings, then sets.
 
     Parameters
     ----------
@@ -70,20 +70,14 @@ def search(
         if second_fit is not None and second_fit.objective < no_effect.objective - least_gain:
             result = Search(problem, usable_effects, second_fit, on_progress=on_progress)
     on_search(result)
-    force_search = None if _needs_grids_of_places(problem) else result.force_search
-    if force_search is not None and force_search.ported.has_channel_for_each_port:
+    force_search = result.force_search
+    if (
+        force_search is not None
+        and force_search.ported.has_all_trials
+        and force_search.ported.has_channel_for_each_port
+    ):
         result.search_by_missing_force(force_search)
     else:
         result.search_single_effects()
         result.search_sets()
     return result
-
-
-def _needs_grids_of_places(problem: Problem) -> bool:
-    """Return whether places on a mesh are searched on grids, with load steps among the trials.
-
-    Masses and losses of a mesh have many places. The grids of `search_single_effects` refit the
-    errors of the mesh at each of them, which the screen beside the missing force does not.
-    """
-    has_load_steps = any(not data.trial.is_dynamic for data in problem.trials)
-    return has_load_steps and bool(problem.model.nuisance_parameters)

@@ -133,6 +133,8 @@ class Model(ABC):
         Whether the internal forces that the model has itself (`built_in_laws`) are left out.
     shows_ports : bool
         Whether the motion of its ports can be computed (`ported_system` and `port_motion`).
+    shows_ports_at_rest : bool
+        Whether the action of forces at its ports at rest can be computed (`ports_at_rest`).
     """
 
     name: str
@@ -162,6 +164,7 @@ class Model(ABC):
     holds_inputs: ClassVar[bool] = False
     follows_windows: ClassVar[bool] = False
     shows_ports: ClassVar[bool] = True
+    shows_ports_at_rest: ClassVar[bool] = True
     linear: bool = False
     _unpatched_parameters: tuple[ParameterPrior, ...] | None = None
     _responses: ResultCache | None = None
@@ -240,9 +243,7 @@ class Model(ABC):
 
         The caller, `ports_at_rest`, has checked the outputs.
         """
-        raise ModelError(
-            f"{capital(self.quoted_name)} does not tell how a force at a port acts at rest."
-        )
+        raise NotImplementedError
 
     def _ported_system(
         self, trial: Trial, outputs: Outputs, parameters: FloatArray
@@ -513,8 +514,7 @@ class Model(ABC):
         Raises
         ------
         ModelError
-            If the model has sensors built in, has no position of rest, or does not tell how a force
-            at a port acts at rest.
+            If the model has sensors built in, or has no position of rest.
         """
         self._check_missing_forces(outputs)
         return self._ports_at_rest(trial, outputs, conditions)

@@ -5,10 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from discrepancy.campaign.records import TrialKind
 from discrepancy.estimation.force_search import ForceSearch
 from discrepancy.estimation.force_states import Process
 from discrepancy.estimation.gauss_newton import linearise_along_laws, start_from_estimate
 from discrepancy.estimation.linearised_rest import LinearisedRest, RestUnderForces
+from discrepancy.estimation.ported_problem import shows_missing_force
 from discrepancy.fits.candidate import Candidate, EffectTerm, Point
 from discrepancy.system.lumped_model import LumpedModel
 from discrepancy.workflow import check_and_prepare
@@ -122,8 +124,26 @@ def test_a_unit_force_moves_a_spring_by_its_compliance(search):
 
 def test_load_steps_narrow_the_parameters(search):
     estimate = search.estimate_without_effects
-    in_motion = estimate.in_motion.linearisation
+    in_motion = replace(estimate.linearisation, trials=estimate.linearisation.in_motion)
     widths_in_motion = np.diag(in_motion.solve(estimate.processes).covariance)
     widths = np.diag(estimate.linearisation.solve(estimate.processes).covariance)
     assert np.all(widths <= widths_in_motion * (1.0 + 1e-9))
     assert np.min(widths / widths_in_motion) < 0.9
+
+
+def test_load_steps_of_a_model_that_tells_nothing_of_its_ports_at_rest_are_left_out(search, monkeypatch):
+    monkeypatch.setattr(LumpedModel, "shows_ports_at_rest", False)
+    problem = search.ported.problem_with_laws
+    in_motion = ForceSearch(problem)
+    assert not in_motion.ported.has_all_trials
+    assert not any(trial.is_at_rest for trial in in_motion.estimate_without_effects.ported_trials)
+    # the unknowns of the load steps stay at their prior means
+    local = in_motion.point(in_motion.estimate_without_effects).local
+    assert [len(values) for values in local] == [data.unknowns.unknown_count for data in problem.trials]
+
+
+def test_missing_forces_are_estimated_in_motion_and_load_steps_but_not_in_missions(search):
+    model = search.ported.model
+    trials = {data.trial.kind: data.trial for data in search.ported.problem.trials}
+    assert all(shows_missing_force(model, trial) for trial in trials.values())
+    assert not shows_missing_force(model, replace(trials[TrialKind.STATIC], kind=TrialKind.FLIGHT))
