@@ -26,8 +26,8 @@ from discrepancy.trials_in_motion.trajectory import (
 from discrepancy.trials_in_motion.trial_at_rest import LinearTrial
 
 from .estimate import Estimate
+from .linear_about_trajectory import Simulation
 from .linearisation import Linearisation, linearised
-from .linearised import Simulation
 from .process_search import Processes, prior_log_density
 from .regression import Priors
 

@@ -13,44 +13,20 @@ is linear in the weights (1, unknowns) and computed here, and a random one, whic
 add (see `filtered`).
 """
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple
 
 import numpy as np
 
 from discrepancy.campaign.records import BoolArray, FloatArray, IntArray
-from discrepancy.trials_in_motion.trajectory import (
-    LinearisedForce,
-    LinearisedSensorErrors,
-    Trajectory,
-)
 from discrepancy.trials_in_motion.trial import PortedTrial
 
 from .kernel import respond_to_drift, substep_matrices_with_laws
-
-CONSTANT = 0
-"""Number of the constant among the weights (1, unknowns)."""
-
-
-class Simulation(NamedTuple):
-    """A trial as simulated under laws alone, without missing forces.
-
-    Attributes
-    ----------
-    local : (L,) ndarray
-        The values of the unknowns of the trial alone.
-    residual : (N, C) ndarray
-        The readings minus the prediction, divided by the noise.
-    """
-
-    local: FloatArray
-    residual: FloatArray
+from .linear_about_trajectory import CONSTANT, LinearAboutTrajectory
 
 
 @dataclass(frozen=True, eq=False)
-class LinearisedTrial:
+class LinearisedTrial(LinearAboutTrajectory):
     """A trial, linear along a trajectory, with the part of its state that the weights determine.
 
     The unknowns are the K shared ones, the E ones of the hypothesis' effects, and those of the
@@ -61,43 +37,9 @@ class LinearisedTrial:
     ----------
     trial : PortedTrial
         The trial with its residuals, its linear system, and the motion of its ports.
-    trajectory : Trajectory
-        The trajectory along which it is linear.
-    forces : mapping of int to LinearisedForce
-        The forces of all laws, by the index of the port.
-    sensor_errors : LinearisedSensorErrors
-        The changes of readings caused by the errors of sensors in the hypothesis.
-    effect : (E,) ndarray
-        The values of the effects' unknowns at which laws and sensors are linearised.
-    shared : (K,) ndarray
-        The values of the shared unknowns at which they are linearised.
-    simulation : Simulation or None
-        The trial as simulated with the values about which it is linear, along whose motion it is.
     """
 
     trial: PortedTrial
-    trajectory: Trajectory
-    forces: Mapping[int, LinearisedForce]
-    sensor_errors: LinearisedSensorErrors
-    effect: FloatArray
-    shared: FloatArray
-    simulation: Simulation | None = None
-
-    # ------------------------------------------------------------ layout
-
-    @property
-    def weight_count(self) -> int:
-        """The number W of weights: the first is one, the others are the unknowns."""
-        return 1 + len(self.shared) + len(self.effect) + len(self.trial.local_derivatives)
-
-    def weight_index(self, unknown_index: int) -> int:
-        """Return the index among the weights of an unknown that is no effect parameter.
-
-        Its given index is that in `PortedTrial.linearisation_point`, where the unknowns of the
-        trial alone follow the shared ones. In the weights, those of effects are between both.
-        """
-        shared_count = len(self.shared)
-        return 1 + unknown_index + (len(self.effect) if unknown_index >= shared_count else 0)
 
     @cached_property
     def law_ports(self) -> tuple[int, ...]:
@@ -105,11 +47,6 @@ class LinearisedTrial:
         return tuple(self.forces)
 
     # ------------------------------------------------------------ forces of the laws
-
-    @property
-    def effect_forces(self) -> dict[int, FloatArray]:
-        """The forces (F,) of the hypothesis' effects along the trajectory, by port."""
-        return {port: force.law_force.force - force.by_model for port, force in self.forces.items()}
 
     @cached_property
     def force_by_state(self) -> FloatArray:
@@ -164,13 +101,9 @@ class LinearisedTrial:
             # unknowns that change the laws; `law.force` is the force at u0
             for unknown_index, derivative in self.forces[port].by_unknown.items():
                 force_coefficients[:, row, 1 + unknown_index] += derivative
-                present_value = self._value_of_unknown(unknown_index)
+                present_value = self.shared_and_effect[unknown_index]
                 force_coefficients[:, row, CONSTANT] -= present_value * derivative
         return force_coefficients
-
-    def _value_of_unknown(self, unknown_index: int) -> float:
-        """Return the value of an unknown, shared or of an effect, about which laws are linear."""
-        return float(np.concatenate((self.shared, self.effect))[unknown_index])
 
     @cached_property
     def state_rate_by_force(self) -> FloatArray:
@@ -304,24 +237,7 @@ class LinearisedTrial:
         does not count.
         """
         trial = self.trial
-        columns = np.zeros((*trial.residual.shape, self.weight_count))
-        # Errors of sensors change the readings by c0 + d (u - u0), which reduces the residual: -d
-        # is added to the coefficient of the unknown u, and -c0 + d u0 to the constant.
-        columns[:, :, CONSTANT] = trial.residual - self.sensor_errors.change
-        for unknown_index, derivative in self.sensor_errors.by_unknown.items():
-            present_value = self._value_of_unknown(unknown_index)
-            columns[:, :, 1 + unknown_index] -= derivative
-            columns[:, :, CONSTANT] += present_value * derivative
-        # The response of the model needs no constant, as `trial.residual` is at zero unknowns. The
-        # unknowns of this trial follow the shared ones here; in u those of effects are between.
-        derivatives = np.concatenate((trial.shared_derivatives, trial.local_derivatives))
-        for unknown_index, derivative in enumerate(derivatives):
-            columns[:, :, self.weight_index(unknown_index)] -= derivative
-        # parameters and gains change the readings of a fixed state by d (u - u0)
-        for unknown_index, derivative in self._readings_by_shared_unknowns().items():
-            present_value = trial.linearisation_point[unknown_index]
-            columns[:, :, 1 + unknown_index] -= derivative
-            columns[:, :, CONSTANT] += present_value * derivative
+        columns = self.columns_of_model_and_sensors(self._readings_by_shared_unknowns())
         # the known part of the state is read, and the laws' forces that a sensor shows at once
         known_states = self.known_states[:: trial.substeps]
         outputs_over_noise = trial.system.outputs / trial.deviation[:, None]
@@ -330,8 +246,7 @@ class LinearisedTrial:
         if self.simulation is not None:
             # The substeps integrate a law to first order. At the values of the simulation the
             # residual is that of the simulation; the derivatives are those along its motion.
-            weights = np.concatenate(([1.0], self.shared, self.effect, self.simulation.local))
-            error = self.simulation.residual - columns @ weights
+            error = self.error_of_columns(columns)
             columns[:, :, CONSTANT] += np.where(self._shows_laws_at_once, 0.0, error)
         return columns * trial.used[:, :, None]
 

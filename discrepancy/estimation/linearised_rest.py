@@ -15,27 +15,21 @@ is independent from one load step to the next: by which displacements its values
 depends on the law, which is not known.
 """
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 
 from discrepancy.campaign.records import FloatArray
-from discrepancy.trials_in_motion.trajectory import (
-    LinearisedForce,
-    LinearisedSensorErrors,
-    Trajectory,
-)
 from discrepancy.trials_in_motion.trial_at_rest import TrialAtRest
 
 from .filtered import SmoothedTrial
-from .linearised import CONSTANT, Simulation
+from .linear_about_trajectory import CONSTANT, LinearAboutTrajectory
 from .process_search import Processes
 
 
 @dataclass(frozen=True, eq=False)
-class LinearisedRest:
+class LinearisedRest(LinearAboutTrajectory):
     """A trial at rest, linear along its positions; it stands beside `LinearisedTrial`.
 
     Shapes: N load steps, C channels, P ports, W weights (one, then the K shared unknowns, the E of
@@ -45,43 +39,9 @@ class LinearisedRest:
     ----------
     trial : TrialAtRest
         The trial with its residuals and the compliance of the model.
-    trajectory : Trajectory
-        The positions of the ports, and the forces there, about which it is linear.
-    forces : mapping of int to LinearisedForce
-        The forces of all laws, by the index of the port.
-    sensor_errors : LinearisedSensorErrors
-        The changes of readings caused by the errors of sensors in the hypothesis.
-    effect, shared : (E,), (K,) ndarray
-        The values of the unknowns of effects, and of the shared ones, about which it is linear.
-    simulation : Simulation or None
-        The trial as simulated with these values.
     """
 
     trial: TrialAtRest
-    trajectory: Trajectory
-    forces: Mapping[int, LinearisedForce]
-    sensor_errors: LinearisedSensorErrors
-    effect: FloatArray
-    shared: FloatArray
-    simulation: Simulation | None = None
-
-    @property
-    def weight_count(self) -> int:
-        """The number W of weights: the first is one, the others are the unknowns."""
-        return 1 + len(self.shared) + len(self.effect) + len(self.trial.local_derivatives)
-
-    def weight_index(self, unknown_index: int) -> int:
-        """Return the index among the weights of an unknown of `TrialAtRest.linearisation_point`.
-
-        The unknowns of effects are between the shared ones and those of the trial alone.
-        """
-        is_local = unknown_index >= len(self.shared)
-        return 1 + unknown_index + (len(self.effect) if is_local else 0)
-
-    @property
-    def effect_forces(self) -> dict[int, FloatArray]:
-        """The forces (N,) of the hypothesis' effects along the trajectory, by port."""
-        return {port: force.law_force.force - force.by_model for port, force in self.forces.items()}
 
     @cached_property
     def _position_slopes(self) -> FloatArray:
@@ -120,7 +80,6 @@ class LinearisedRest:
     def force_by_weight(self) -> FloatArray:
         """The force h (N, P, W) at each port without missing forces, for a unit of each weight."""
         forces = self._position_slopes[:, :, None] * self.positions_by_weight
-        unknowns = np.concatenate((self.shared, self.effect))
         for port, force in self.forces.items():
             law = force.law_force
             forces[:, port, CONSTANT] += (
@@ -128,7 +87,7 @@ class LinearisedRest:
             )
             for unknown_index, derivative in force.by_unknown.items():
                 forces[:, port, 1 + unknown_index] += derivative
-                forces[:, port, CONSTANT] -= unknowns[unknown_index] * derivative
+                forces[:, port, CONSTANT] -= self.shared_and_effect[unknown_index] * derivative
         return np.asarray(self.force_by_own_force @ forces)
 
     @cached_property
@@ -140,26 +99,11 @@ class LinearisedRest:
         the noise, and zero for a reading that does not count.
         """
         trial = self.trial
-        columns = np.zeros((*trial.residual.shape, self.weight_count))
-        columns[:, :, CONSTANT] = trial.residual - self.sensor_errors.change
-        # errors of sensors change the readings by c0 + d (u - u0), which lowers the residual
-        unknowns = np.concatenate((self.shared, self.effect))
-        for unknown_index, derivative in self.sensor_errors.by_unknown.items():
-            columns[:, :, 1 + unknown_index] -= derivative
-            columns[:, :, CONSTANT] += unknowns[unknown_index] * derivative
-        # the response of the model is linear about zero unknowns already
-        derivatives = np.concatenate((trial.shared_derivatives, trial.local_derivatives))
-        for unknown_index, derivative in enumerate(derivatives):
-            columns[:, :, self.weight_index(unknown_index)] -= derivative
-        # parameters and gains change the readings of given forces
-        for unknown_index, derivative in self._readings_by_unknowns().items():
-            columns[:, :, self.weight_index(unknown_index)] -= derivative
-            columns[:, :, CONSTANT] += trial.linearisation_point[unknown_index] * derivative
+        columns = self.columns_of_model_and_sensors(self._readings_by_unknowns())
         columns += np.einsum("npc,npw->ncw", trial.response.outputs_by_force, self.force_by_weight)
         if self.simulation is not None:
             # at the values of the simulation, the residual is that of the simulation
-            weights = np.concatenate(([1.0], unknowns, self.simulation.local))
-            columns[:, :, CONSTANT] += self.simulation.residual - columns @ weights
+            columns[:, :, CONSTANT] += self.error_of_columns(columns)
         return columns * trial.used[:, :, None]
 
     def _readings_by_unknowns(self) -> dict[int, FloatArray]:

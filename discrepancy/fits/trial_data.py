@@ -406,6 +406,12 @@ class TrialData:
     weight: FloatArray
     noise_models: tuple[NoiseModel, ...]
 
+    @property
+    def sample_deviation(self) -> FloatArray:
+        """The standard deviation (C,) of a single reading, whether or not its noise is whitened."""
+        deviations = [noise.static_deviation for noise in self.noise_models]
+        return np.asarray(self.trial.noise_factor * np.array(deviations))
+
     def standardise(self, columns: FloatArray) -> FloatArray:
         """Return readings or their derivatives in units of the noise, whitened.
 

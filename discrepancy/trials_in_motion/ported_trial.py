@@ -103,9 +103,7 @@ def ported_trial(problem: Problem, trial_index: int, point: Point) -> PortedTria
     # response of the model, about which the missing forces are added
     positions_and_speeds, by_unknowns = _port_motion(problem, trial_index, point, substeps)
     residual, by_shared, by_local = residual_and_derivatives(problem, trial_index, point)
-    deviation = trial.noise_factor * np.array(
-        [noise.static_deviation for noise in data.noise_models]
-    )
+    deviation = data.sample_deviation
     return PortedTrial(
         name=trial.name,
         time=trial.time,

@@ -248,9 +248,7 @@ def trial_at_rest(problem: Problem, trial_index: int, point: Point) -> TrialAtRe
     data = problem.trials[trial_index]
     trial = data.trial
     gains = 1.0 + problem.shared.gains(point.shared, trial.channels)
-    deviation = trial.noise_factor * np.array(
-        [noise.static_deviation for noise in data.noise_models]
-    )
+    deviation = data.sample_deviation
     residual, by_shared, by_local = residual_and_derivatives(problem, trial_index, point)
     response, derivatives = _response_and_derivatives(problem, trial_index, point)
     readings_per_output = gains / deviation * trial.used[:, None, :]  # (N, 1, C)
