@@ -27,6 +27,9 @@ SEED = 20210527
 FREE_PRECISION = 1e-4
 """Precision of a scaled unknown with a flat prior: a free zero is known to a hundred noise
 deviations."""
+LEAST_VARIANCE = 1e-12
+"""Variance that is added to that of each scaled unknown, so that a covariance that is singular to
+rounding has a Cholesky factor."""
 LEAST_SINGULAR_VALUE = 1e-6
 """Singular value, relative to the largest, below which a direction in the space of readings is left
 out: all hypotheses predict the same there."""
@@ -156,17 +159,21 @@ def _predictions(
     fits: Sequence[CandidateFit],
     model: Model,
 ) -> "list[_PredictedTrial]":
-    """Return the prediction of a new trial, with additional sensors, by each hypothesis."""
-    recorded_over_actual_noise = _recorded_over_actual_noise(problem, most_probable_fit=fits[0])
-    numbers_of_noise = [problem.channel_names.index(sensor.noise_of) for sensor in sensors]
-    recorded_over_actual_noise = np.append(
-        recorded_over_actual_noise, recorded_over_actual_noise[numbers_of_noise]
+    """Return the prediction of a new trial, with additional sensors, by each hypothesis.
+
+    An additional sensor has the noise of a present channel, `AddedSensor.noise_of`.
+    """
+    noise_ratio_of_channels = _recorded_over_actual_noise(problem, most_probable_fit=fits[0])
+    # the channels of the problem come first, then the additional sensors
+    noise_channel_indices = [problem.channel_names.index(sensor.noise_of) for sensor in sensors]
+    noise_ratios = np.append(
+        noise_ratio_of_channels, noise_ratio_of_channels[noise_channel_indices]
     )
+    problem_with_sensors = problem
     for sensor in sensors:
-        problem = problem.with_channel(sensor.channel, sensor.noise_of)
-    trial = _with_sensors(trial, sensors)
-    trial_problem = problem.with_trials((trial,), model)
-    return [_predicted_trial(trial_problem, fit, recorded_over_actual_noise) for fit in fits]
+        problem_with_sensors = problem_with_sensors.with_channel(sensor.channel, sensor.noise_of)
+    trial_problem = problem_with_sensors.with_trials((_with_sensors(trial, sensors),), model)
+    return [_predicted_trial(trial_problem, fit, noise_ratios) for fit in fits]
 
 
 def _recorded_over_actual_noise(problem: Problem, most_probable_fit: CandidateFit) -> FloatArray:
@@ -208,8 +215,11 @@ def _predicted_trial(
 ) -> _PredictedTrial:
     """Return the Gaussian prediction of a new trial by a hypothesis, over the noise deviation.
 
-    Its covariance comes from the prior of the trial's own unknowns, such as zeros of channels, and
-    from the posterior of the unknowns that the trial shares with the fitted trials.
+    Its covariance has three sources:
+
+    - the prior of the trial's own unknowns, such as zeros of channels;
+    - the posterior of the unknowns that the trial shares with the fitted trials;
+    - the prior of gain errors of channels that no fitted trial has.
 
     Parameters
     ----------
@@ -218,7 +228,7 @@ def _predicted_trial(
     recorded_over_actual_noise : (channels,) array
         The recorded noise deviation of each channel, divided by the actual one.
     """
-    data = trial_problem.trials[0]
+    data = trial_problem.trials[0]  # the new trial, the only one of the problem
     local_count = data.unknowns.unknown_count
     # the trial's own unknowns are at their prior means: no reading has determined them
     point = Point(fit.point.shared, (np.zeros(local_count),), fit.point.effect)
@@ -226,8 +236,9 @@ def _predicted_trial(
     derivatives_by_unknowns, shared_indices = trial_problem.prediction_derivatives(
         0, point, derivatives, fit.candidate
     )
-    # derivatives of the readings, by the trial's own unknowns first, in actual noise deviations
+    # `standardise` divides by the recorded noise, and this scale turns it into the actual noise
     reading_scale = recorded_over_actual_noise[data.channel_indices]  # (C,)
+    # (unknowns, N, C), the trial's own unknowns first
     jacobian = data.standardise(derivatives_by_unknowns) * reading_scale
     local_jacobian, shared_jacobian = np.split(jacobian, [local_count])
     prediction = trial_problem.prediction(0, point, derivatives.response)
@@ -236,7 +247,7 @@ def _predicted_trial(
     # unknowns and J their derivatives, J^T C J = (R^T J)^T (R^T J); own unknowns are independent
     # with the variance 1 / precision
     covariance = fit.covariance[np.ix_(shared_indices, shared_indices)]
-    covariance_root = np.linalg.cholesky(covariance + 1e-12 * np.eye(len(shared_indices)))
+    covariance_root = np.linalg.cholesky(covariance + LEAST_VARIANCE * np.eye(len(shared_indices)))
     prior_precision = np.maximum(data.unknowns.precision, FREE_PRECISION)
     local_factor = local_jacobian / np.sqrt(prior_precision)[:, np.newaxis, np.newaxis]
     shared_factor = np.tensordot(covariance_root.T, shared_jacobian, 1)
