@@ -436,8 +436,8 @@ class FmuModel(DescribedModel):
     def _has_jumping_port_speed(self, system: FmuStateSpace) -> bool:
         """Return whether the speed of a port jumps with the force there, as no mass resists it."""
         port_displacements = np.array(self.fmu.displacement_columns, dtype=np.int64)
-        port_forces = np.arange(len(port_displacements))
-        return system.has_jumping_speed(port_displacements, port_forces)
+        # the forces at the ports are the first inputs, in the order of the ports
+        return system.has_jumping_speed(port_displacements, np.arange(len(port_displacements)))
 
     def _system_with_parameters(self, trial: Trial, parameters: FloatArray) -> FmuStateSpace | None:
         """Return the linear system at values of the parameters; None if the FMU is not linear.
