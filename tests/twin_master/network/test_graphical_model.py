@@ -283,7 +283,10 @@ REFUSED = [
     (lambda: StateSpace(()), "different names"),
     (lambda: Factor("", LEVELS), "needs a name"),
     (lambda: TransitionModel((np.full((2, 3, 4), 0.25),)), r"a transition of shape \(controls, 4, 4\)"),
-    (lambda: TransitionModel.from_factors([[np.eye(2)], [np.eye(3)]]), "the same states"),
+    (
+        lambda: TransitionModel.from_factors([[np.eye(2)], [np.eye(3)]]),
+        "one square table for each factor, of the same size",
+    ),
     (lambda: TransitionModel.from_factors([[[[0.5, 0.5]]]]), "square table"),
     (lambda: TransitionModel.from_factors([[]]), "square table"),
     (lambda: GraphicalModel(SPACE, ("2g", "3g"), PRIOR, MOVES), r"a transition of shape \(2, 15, 15\)"),
