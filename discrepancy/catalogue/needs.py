@@ -45,8 +45,7 @@ def _no_trial(effect: EffectInSetting, kinds: Kinds = frozenset()) -> str | None
 def _no_motion_or_weight(effect: EffectInSetting) -> str | None:
     """Return the reason if an added mass has neither inertia nor weight in any trial, else None."""
     model = effect.setting.model
-    kinds = DYNAMIC | {TrialKind.FLIGHT} if not model.shows_weight else frozenset(TrialKind)
-    return _no_trial(effect, kinds & effect.section.acts_on)
+    return _no_trial(effect, (DYNAMIC | model.kinds_with_weight) & effect.section.acts_on)
 
 
 def _no_event(effect: EffectInSetting) -> str | None:

@@ -106,9 +106,9 @@ class Model(ABC):
     mass_reaches : mapping of str to float
         Distance from a place within which a mass is nearest to it [m]; a mass lies exactly at the
         places that are left out.
-    shows_weight : bool
-        Whether an acceleration, such as gravity, acts on the masses that are added at places, so
-        that these show at rest.
+    kinds_with_weight : frozenset of TrialKind
+        The kinds of static trials in which an acceleration, such as gravity, acts on the masses
+        that are added at places, so that these show at rest.
     loss_places : tuple of str
         Patches that are no damage regions and may lose stiffness.
     places_with_gauges : frozenset of str
@@ -152,7 +152,7 @@ class Model(ABC):
     interface_motions: tuple[tuple[str, str], ...] = ()
     mass_places: tuple[str, ...] = ()
     mass_reaches: Mapping[str, float] = MappingProxyType({})
-    shows_weight: bool = False
+    kinds_with_weight: frozenset[TrialKind] = frozenset()
     loss_places: tuple[str, ...] = ()
     places_with_gauges: frozenset[str] = frozenset()
     load_changes: tuple[tuple[str, str, str], ...] = ()

@@ -155,7 +155,7 @@ class StructureModel(SystemModel):
         self.interface_motions = tuple(pair for pair in motions if pair[1] in INTERFACE_MOTIONS)
         self.mass_places = model.mass_places
         reaches = zip(model.mass_places, model.mass_reaches.tolist(), strict=True)
-        self.shows_weight = bool(model.load_accelerations.any())
+        self.kinds_with_weight = self._kinds_with_weight(model)
         self.mass_reaches = {place: reach for place, reach in reaches if reach > 0.0}
         self.loss_places = model.loss_places
         patches_with_gauges = np.unique(model.patch_of_gauge[model.patch_of_gauge >= 0]).tolist()
@@ -256,6 +256,24 @@ class StructureModel(SystemModel):
             return ()
         return self.model.changes_of(state.structure).numbers
 
+    def _kinds_with_weight(self, model: ChangeableModel) -> frozenset[TrialKind]:
+        """Return the kinds of static trials in which added masses have weight.
+
+        A load factor gives it in flights, a constant acceleration in load steps, too.
+        """
+        state = SystemState(tuple(self.prior_mean().tolist()))
+        recorded = dict.fromkeys((*self.forces, LOAD_FACTOR), 0.0)
+        kinds = set()
+        for kind, controls in (
+            (TrialKind.STATIC, recorded),
+            (TrialKind.FLIGHT, recorded | {LOAD_FACTOR: 1.0}),
+        ):
+            in_model = {name: value for name, value in controls.items() if name in model.controls}
+            coefficients = model.load_coefficients(self._input_vector(state, in_model))
+            if (coefficients @ model.load_accelerations).any():
+                kinds.add(kind)
+        return frozenset(kinds)
+
     def _in_state(self, load: FloatArray, state: SystemState) -> FloatArray:
         """Return a load (n,) of the reduced model in the k coordinates of a state, (k,).
 
@@ -348,7 +366,7 @@ class StructureModel(SystemModel):
         self, trial: Trial, outputs: Outputs, patch: ModelPatch, conditions: Conditions
     ) -> Response:
         """Return the true response of a trial; added masses without weight change none at rest."""
-        if not trial.is_dynamic and not self.shows_weight:
+        if not trial.is_dynamic and trial.kind not in self.kinds_with_weight:
             patch = patch.without(changes.PlaceMass)
         return super().respond(trial, outputs, patch, conditions)
 

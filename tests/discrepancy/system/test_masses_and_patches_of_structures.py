@@ -3,6 +3,8 @@
 import numpy as np
 import pytest
 
+from discrepancy.campaign.records import TrialKind
+from discrepancy.model_choice import choose_model
 from discrepancy.system.interface import NO_PATCH
 from discrepancy.system.system_state import SystemState
 from discrepancy.verdict import VerdictKind
@@ -55,6 +57,19 @@ def test_a_mass_shows_by_its_weight_at_rest(beam_model) -> None:
     added = lifts[1] - lifts[0]
     push = beam_model.force_row("push", state)
     np.testing.assert_allclose(added, -0.981 * push, atol=1e-6 * np.abs(push).max())
+
+
+def test_a_load_factor_gives_masses_weight_in_flights_alone(beam_model) -> None:
+    assert beam_model.kinds_with_weight == {TrialKind.FLIGHT}
+
+
+def test_a_constant_acceleration_gives_masses_weight_in_load_steps(write_beam, tmp_path) -> None:
+    always = {
+        '    { name = "load_factor", minimum = -4, maximum = 6 },\n': "",
+        'name = "weight", control = "load_factor"': 'name = "weight"',
+    }
+    model = choose_model(write_beam(tmp_path, always, cells=4)).model
+    assert TrialKind.STATIC in model.kinds_with_weight
 
 
 def test_places_of_masses_are_sets_and_points(beam_model) -> None:
