@@ -7,14 +7,12 @@ from typing import Protocol
 
 import numpy as np
 
-from calibration.result.record import ParameterPrior
 from discrepancy.campaign.records import Campaign, FloatArray, Quantity, Trial, TrialKind
 from discrepancy.errors import ModelError
 from discrepancy.system.excitation import Excitation, Load
 from discrepancy.system.interface import NO_PATCH, MassPoint
 from discrepancy.system.linear_system import LinearSystem, SolvedStructure
 from discrepancy.system.load_change import choose_load_place
-from discrepancy.system.mesh_errors import WithMeshErrors, mesh_errors_of
 from discrepancy.system.output_equation import OutputEquation
 from discrepancy.system.response import ACROSS, Conditions, Outputs, Place, Response
 from discrepancy.system.scales import Scales
@@ -24,6 +22,7 @@ from discrepancy.system.structure_rows import (
     strains_near_gauges,
     strains_of_possible_gauges,
 )
+from discrepancy.system.structure_unknowns import WithMeshErrors, mesh_errors_of, parameter_priors
 from discrepancy.system.system_model import SystemModel
 from discrepancy.system.system_state import PatchedTrial, SystemState
 from discrepancy.system.time_history import RecordedHistory
@@ -46,8 +45,6 @@ from fe.structure.tables import INTERFACE_MOTIONS, MOTIONS
 
 LOAD_FACTOR = "load_factor"
 """Control that is the load factor of flights."""
-DEVIATION = 0.25
-"""Standard deviation of a parameter that was not calibrated, as a fraction of its range."""
 LARGEST_LOSS = 0.7
 """Largest loss of stiffness of a patch that is compared."""
 
@@ -78,7 +75,7 @@ class StructureWithMatrices(SolvedStructure, Protocol):
 class StructureModel(SystemModel):
     """A structure from a mesh or matrices, by its reduced model.
 
-    The prior of its parameters and free masses has the standard deviation `DEVIATION`. A control
+    The prior of its parameters and free masses is that of `parameter_priors`. A control
     with the unit N is a force. If its load acts along a displacement output, in either direction,
     there is a port with the name and the sign of that output; the ports of the file follow these.
     Other controls are nominal, except for the load factor, which is zero if a trial records none.
@@ -102,7 +99,7 @@ class StructureModel(SystemModel):
         self._place_rows: dict[str, FloatArray] = {}
         self.regions = model.regions
         self.largest_losses = {region: model.validity[region][1] for region in model.regions}
-        self.parameters = _parameter_priors(model)
+        self.parameters = parameter_priors(model)
         if isinstance(model, ChangeableModel):
             mesh_errors = mesh_errors_of(model)
             self.parameters += mesh_errors
@@ -501,21 +498,6 @@ class StructureModel(SystemModel):
             for motion, gain in zip(motions, largest_gains, strict=True)
         }
         return replace(scales, support_compliances=compliances)
-
-
-def _parameter_priors(model: ReducedModel) -> tuple[ParameterPrior, ...]:
-    """Return the priors of parameters and free masses.
-
-    The means are the nominal values, and the standard deviations `DEVIATION` times the ranges.
-    """
-    nominal_values = dict(zip(model.input_names, model.nominal.tolist(), strict=True))
-    units = dict.fromkeys(model.parameters, "1") | dict.fromkeys(model.masses, "kg")
-    priors = []
-    for name, unit in units.items():
-        low, high = model.validity[name]
-        deviation = DEVIATION * (high - low)
-        priors.append(ParameterPrior(name, unit, nominal_values[name], deviation, low, high))
-    return tuple(priors)
 
 
 def _is_at_port(name: str) -> bool:

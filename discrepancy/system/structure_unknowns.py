@@ -1,4 +1,4 @@
-"""Errors of natural frequencies by the mesh of a structure, which are fitted beside it."""
+"""The unknowns of a structure that are fitted: its parameters, masses, and errors of its mesh."""
 
 from calibration.result.record import ParameterPrior
 from discrepancy.campaign.records import FloatArray
@@ -6,6 +6,8 @@ from discrepancy.system.linear_system import SolvedStructure
 from fe.runtime.changeable import ChangedModes
 from fe.runtime.reduced import ReducedModel
 
+DEVIATION = 0.25
+"""Standard deviation of a parameter that was not calibrated, as a fraction of its range."""
 MESH_DEVIATION = 0.01
 """Standard deviation of the relative error of a frequency by the mesh. A ring-down shows a
 frequency to a few parts in 10^5, while a mesh of ordinary fineness has errors of 0.1 to 1.5 percent
@@ -14,6 +16,21 @@ LARGEST_MESH_ERROR = 0.05
 """Largest relative error of a frequency by the mesh that is fitted."""
 MODES_OF_MESH_ERRORS = 4
 """Number of modes whose frequencies may differ by the mesh; readings hardly show higher ones."""
+
+
+def parameter_priors(model: ReducedModel) -> tuple[ParameterPrior, ...]:
+    """Return the priors of parameters and free masses.
+
+    The means are the nominal values, and the standard deviations `DEVIATION` times the ranges.
+    """
+    nominal_values = dict(zip(model.input_names, model.nominal.tolist(), strict=True))
+    units = dict.fromkeys(model.parameters, "1") | dict.fromkeys(model.masses, "kg")
+    priors = []
+    for name, unit in units.items():
+        low, high = model.validity[name]
+        deviation = DEVIATION * (high - low)
+        priors.append(ParameterPrior(name, unit, nominal_values[name], deviation, low, high))
+    return tuple(priors)
 
 
 def mesh_errors_of(model: ReducedModel) -> tuple[ParameterPrior, ...]:
