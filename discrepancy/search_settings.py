@@ -67,6 +67,8 @@ class SearchSettings:
     and the right one is narrow."""
     coarse_level_step: int = 5
     """Step between the levels of that grid that are tried first at each of many places."""
+    places_with_all_levels: int = 10
+    """Number of places, the best at these levels, at which the levels between are tried, too."""
     first_periods: float = 4.0
     """Number of periods of the first mode in which the best of many places are chosen."""
     places_far_from_data: int = 3

@@ -274,7 +274,7 @@ def calibrate_ringdown(
         typer.Option(
             "--start",
             min=0.0,
-            help="Where records are cropped [s]; the first peak by default.",
+            help="Time at which records are cropped, in seconds; the first peak by default.",
         ),
     ] = None,
 ) -> None:
@@ -363,16 +363,16 @@ def calibrate_simulate(
     ],
     e: Annotated[float, typer.Option("--e", help="True Young's modulus factor.")] = 1.0073,
     servo_mass: Annotated[
-        float, typer.Option("--servo-mass", help="True mass of each servo [kg].")
+        float, typer.Option("--servo-mass", help="True mass of each servo, in kg.")
     ] = 0.169,
     pitot_mass: Annotated[
-        float, typer.Option("--pitot-mass", help="True mass of the pitot tube [kg].")
+        float, typer.Option("--pitot-mass", help="True mass of the pitot tube, in kg.")
     ] = 0.134,
     alpha: Annotated[
-        float, typer.Option("--alpha", help="True mass-proportional damping [1/s].")
+        float, typer.Option("--alpha", help="True mass-proportional damping, in 1/s.")
     ] = 1.03,
     beta: Annotated[
-        float, typer.Option("--beta", help="True stiffness-proportional damping [s].")
+        float, typer.Option("--beta", help="True stiffness-proportional damping, in seconds.")
     ] = 0.000766,
     seed: Annotated[
         int, typer.Option("--seed", min=0, max=LARGEST_SEED, help="Seed of all errors.")

@@ -23,16 +23,17 @@ def suspects(
     file: StructureArgument,
     *,
     strain_noise: Annotated[
-        float, typer.Option(min=1e-9, help="Standard deviation of a strain reading [microstrain].")
+        float,
+        typer.Option(min=1e-9, help="Standard deviation of strain readings, in microstrain."),
     ] = 1.0,
     displacement_noise: Annotated[
-        float, typer.Option(min=1e-12, help="Standard deviation of a displacement reading [mm].")
+        float, typer.Option(min=1e-12, help="Standard deviation of displacement readings, in mm.")
     ] = 1e-3,
     acceleration_noise: Annotated[
-        float, typer.Option(min=1e-12, help="Standard deviation of an acceleration [m/s2].")
+        float, typer.Option(min=1e-12, help="Standard deviation of accelerations, in m/s2.")
     ] = 0.01,
     gain: Annotated[
-        float, typer.Option(min=0.0, help="Standard deviation of a gain's error [%].")
+        float, typer.Option(min=0.0, help="Standard deviation of gain errors, in %.")
     ] = 1.0,
     json: JsonOption = False,
 ) -> None:

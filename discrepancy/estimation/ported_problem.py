@@ -40,6 +40,20 @@ def can_estimate_forces(problem: Problem) -> bool:
     return model.shows_ports and bool(model.ports) and shows_a_force
 
 
+def shows_all_missing_forces(problem: Problem) -> bool:
+    """Return whether missing forces can be estimated in all trials, so that they are comparable.
+
+    Each trial needs at least as many channels as there are ports. Free forces at more ports than
+    that fit any reading, whatever law acts at one of them.
+    """
+    trials = [data.trial for data in problem.trials]
+    return can_estimate_forces(problem) and all(
+        shows_missing_force(problem.model, trial)
+        and len(trial.channels) >= len(problem.model.ports)
+        for trial in trials
+    )
+
+
 def shows_missing_force(model: Model, trial: Trial) -> bool:
     """Return whether missing forces are estimated in a trial.
 
@@ -103,19 +117,6 @@ class PortedProblem:
         )
         low, high = self.problem.shared.bounds
         self.shared_priors = Priors(self.problem.shared.precision, low, high)
-
-    @property
-    def has_channel_for_each_port(self) -> bool:
-        """Whether each trial has at least as many channels as there are ports.
-
-        Free forces at more ports than that fit any reading, whatever law acts at one of them.
-        """
-        return all(len(data.trial.channels) >= len(self.ports) for data in self.problem.trials)
-
-    @property
-    def has_all_trials(self) -> bool:
-        """Whether all trials of the problem show missing forces, so that none is left out."""
-        return len(self.trial_indices) == len(self.problem.trials)
 
     def linearise(
         self,

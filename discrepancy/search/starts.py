@@ -323,10 +323,10 @@ def _best_places(
 
     Each place is searched on its own, since the magnitude that gives the measured first frequency
     differs between places. Every `SEARCH.coarse_level_step`-th of the levels (L,) is tried first,
-    then the levels next to the best of them. Objectives are compared to two digits; places that are
-    then equal stay in their given order, in which named sets of nodes come first. Where errors of a
-    mesh are fitted, the points are fitted to the first periods: in the whole record, phases drift
-    too far for a fit to begin at a grid.
+    then, at the best `SEARCH.places_with_all_levels` places, the levels next to the best of them.
+    Objectives are compared to two digits; places that are then equal stay in their given order, in
+    which named sets of nodes come first. Where errors of a mesh are fitted, the points are fitted
+    to the first periods: in the whole record, phases drift too far for a fit to begin at a grid.
     """
     early_problem = _problem_of_first_periods(problem)
     early_base = base
@@ -339,16 +339,19 @@ def _best_places(
         return _grid_points(early_problem, early_base, screen, effect, [place], place_levels)
 
     half_step = SEARCH.coarse_level_step // 2
-    coarse_indices = np.arange(half_step, len(levels), SEARCH.coarse_level_step)
+    coarse_levels = levels[half_step :: SEARCH.coarse_level_step]
+    coarse_points = [points[0] for place in places if (points := points_at(place, coarse_levels))]
+    objectives = sorted(point.objective for point in coarse_points)
+    largest_objective = objectives[: SEARCH.places_with_all_levels][-1]
     best_of_places = []
-    for place in places:
-        coarse = points_at(place, levels[coarse_indices])
-        if not coarse:
+    for coarse_point in coarse_points:
+        if coarse_point.objective > largest_objective:
             continue
-        best_index = int(np.argmin(np.abs(levels - coarse[0].start.point.effect[len(base.effect)])))
+        level = coarse_point.start.point.effect[len(base.effect)]
+        best_index = int(np.argmin(np.abs(levels - level)))
         nearby = levels[max(best_index - half_step, 0) : best_index + half_step + 1]
-        fine = points_at(place, nearby)
-        best_of_places.append(min((*coarse, *fine), key=lambda point: point.objective))
+        fine_points = points_at(coarse_point.place, nearby)
+        best_of_places.append(min((coarse_point, *fine_points), key=lambda point: point.objective))
     best_of_places.sort(key=lambda point: float(f"{point.objective:.1e}"))
     best_of_places = best_of_places[: SEARCH.places_far_from_data]
     if not problem.model.nuisance_parameters:

@@ -346,7 +346,7 @@ class Search(FittedCandidates):
         if not self.best().candidate.has_free_shape:
             terms = self.best().candidate.terms
             begins_with_several_places = len(terms) == 1 and terms[0].effect.at_several_places
-            if not begins_with_several_places:
+            if not begins_with_several_places and self.is_unexplained():
                 self.fit_effects_at_several_places()
             self.add_effects()
             if begins_with_several_places and self._leaves_much(self.best()):
@@ -356,6 +356,7 @@ class Search(FittedCandidates):
         self.move_effects()
         self.drop_effects()
         other_optima.refit_from_other_stretches(self, self.on_progress)
+        other_optima.refit_masses_from_nearest_points(self, self.on_progress)
         self.refine_time_steps()
 
     def search_by_missing_force(self, force_search: ForceSearch) -> None:
@@ -418,10 +419,21 @@ class Search(FittedCandidates):
         If such an effect acts at two places, it explains little at one place alone. Errors of
         sensors may then explain more, and `add_effects`, which begins with the best fit, would not
         reach it. So places are added to each such effect on its own, as long as the score rises.
+        On a mesh the same holds for two different effects that change mass or stiffness, such as a
+        mass and a yielding support: each of them is added to each other one, until a set explains
+        the data.
         """
-        for effect in self.effects:
-            if not effect.at_several_places:
-                continue
+        several_places = [effect for effect in self.effects if effect.at_several_places]
+        mesh_changes: list[Effect] = []
+        if self.problem.model.nuisance_parameters:
+            setting = self.problem.setting
+            mesh_changes = [
+                effect for effect in several_places if moves_frequencies(effect, setting)
+            ]
+        for effect in several_places:
+            if mesh_changes and not self.is_unexplained():
+                break
+            added_effects = mesh_changes if effect in mesh_changes else [effect]
             single_fits = [
                 fit
                 for fit in (*self.exact_fits.values(), *self.rough_fits.values())
@@ -432,7 +444,7 @@ class Search(FittedCandidates):
             current_fit = max(single_fits, key=self.score)
             while len(current_fit.candidate.terms) < SEARCH.largest_set:
                 current_score = self.score(current_fit)
-                rough_fits = self.fit_one_more_effect(current_fit, [effect])
+                rough_fits = self.fit_one_more_effect(current_fit, added_effects)
                 score_limit = current_score - SEARCH.largest_longer_set_deficit
                 exact_fits = self.fit_best_exactly(rough_fits, score_limit)
                 if not exact_fits or self.score(exact_fits[0]) <= current_score:

@@ -4,6 +4,7 @@ from collections.abc import Callable, Sequence
 
 from discrepancy.catalogue.entry import Effect
 from discrepancy.catalogue.library import variants_in_events, with_prior_weights
+from discrepancy.estimation.ported_problem import shows_all_missing_forces
 from discrepancy.fits.beginnings import refit_from_first_readings
 from discrepancy.fits.candidate import Candidate
 from discrepancy.fits.fitting import fit, try_fit
@@ -30,9 +31,9 @@ def search(
     """Search the catalogue for the set of effects that explains a campaign.
 
     The model without effect is fitted first. If all trials show missing forces (see
-    `shows_missing_force`), each with at least as many channels as the model has ports, sets of
-    effects are compared by the force that they leave missing. Otherwise, or if that force cannot be
-    estimated, single effects are fitted to the readings, then sets.
+    `shows_all_missing_forces`), sets of effects are compared by the force that they leave missing.
+    Otherwise, or if that force cannot be estimated, single effects are fitted to the readings, then
+    sets.
 
     Parameters
     ----------
@@ -70,13 +71,8 @@ def search(
         if second_fit is not None and second_fit.objective < no_effect.objective - least_gain:
             result = Search(problem, usable_effects, second_fit, on_progress=on_progress)
     on_search(result)
-    force_search = result.force_search
-    if (
-        force_search is not None
-        and force_search.ported.has_all_trials
-        and force_search.ported.has_channel_for_each_port
-    ):
-        result.search_by_missing_force(force_search)
+    if shows_all_missing_forces(problem) and result.force_search is not None:
+        result.search_by_missing_force(result.force_search)
     else:
         result.search_single_effects()
         result.search_sets()

@@ -9,6 +9,7 @@ import sys
 from typing import Any
 
 import pytest
+from rich.text import Text
 
 from reporting import terminal
 from reporting.choices import did_you_mean
@@ -47,6 +48,16 @@ def example_of(words: str) -> str:
 def test_the_help_of_a_command_ends_with_one_example(words):
     assert example_of(words)
     assert inspect.cleandoc(COMMANDS[words].help).endswith("`")
+
+
+def test_the_help_loses_no_word_in_brackets():
+    """The help is read as markup, in which [mm] is a style."""
+    texts = []
+    for command in COMMANDS.values():
+        helps = [parameter.help for parameter in command.params if hasattr(parameter, "help")]
+        texts += [text for text in (command.help, *helps) if text]
+    assert len(texts) > 100
+    assert [text for text in texts if Text.from_markup(text).plain != text] == []
 
 
 @pytest.mark.parametrize("words", sorted(COMMANDS))

@@ -1,15 +1,24 @@
 """A mass at a place, and a patch of a mesh that loses stiffness, are causes that are tried."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from discrepancy.campaign.records import TrialKind
+from discrepancy.estimation.estimate import NO_EFFECTS
+from discrepancy.fits.candidate import Candidate, EffectTerm
+from discrepancy.fits.fitting import fit, try_fit
 from discrepancy.model_choice import choose_model
+from discrepancy.search.fitted_candidates import FittedCandidates
+from discrepancy.search.other_optima import refit_masses_from_nearest_points
+from discrepancy.search.strategy import Search
 from discrepancy.system.interface import NO_PATCH
 from discrepancy.system.system_state import SystemState
 from discrepancy.verdict import VerdictKind
 from discrepancy.workflow import investigate
 from fe.runtime.patch import ModelPatch, PlaceMass
+from tests.discrepancy.core.kit import problem_of
 from tests.discrepancy.rigs import chosen, setting_of, simulated
 
 RIVALS = chosen("added_mass", "support_compliance", "region_stiffness_loss", "gauge_gain", "clock_error")
@@ -45,6 +54,40 @@ def test_a_mass_beside_a_point_is_named_with_its_distance(beam_model) -> None:
     true_point = beam_model.point_of_mass(PlaceMass(place, 0.1, along=-0.6 * reach)).point
     point = beam_model.point_of_mass(mass).point
     assert np.linalg.norm(point - true_point) < 0.5 * reach
+
+
+def test_a_fit_beside_a_wrong_point_moves_to_the_point_next_to_the_mass(beam_model) -> None:
+    true_place, wrong_place = "the point (100, 20, 10) mm", "the point (75, 20, 10) mm"
+    campaign = simulated(beam_model, "laboratory", 3, ("added_mass", {"mass_ratio": 0.2}, true_place))
+    problem = problem_of(campaign, beam_model)
+    (effect,) = chosen("added_mass")
+    term = EffectTerm(effect, wrong_place)
+    start = replace(problem.prior_mean_point(NO_EFFECTS), effect=term.start_values())
+    no_effect = try_fit(problem, NO_EFFECTS, problem.prior_mean_point(NO_EFFECTS))
+    candidates = FittedCandidates(problem, (effect,), no_effect)
+    beside_wrong_point = candidates.record_fit(fit(problem, Candidate((term,)), start), exact=True)
+    refit_masses_from_nearest_points(candidates, lambda message: None)
+    best = candidates.best()
+    assert [moved.place for moved in best.candidate.terms] == [true_place]
+    assert best.log_evidence > beside_wrong_point.log_evidence + 10.0
+
+
+def test_different_changes_of_a_mesh_are_tried_together(beam_model, monkeypatch) -> None:
+    campaign = simulated(beam_model, "laboratory", 3, ("added_mass", *HIDDEN["added_mass"]))
+    problem = problem_of(campaign, beam_model)
+    no_effect = try_fit(problem, NO_EFFECTS, problem.prior_mean_point(NO_EFFECTS), iterations=0)
+    search = Search(problem, chosen("added_mass", "region_stiffness_loss", "gauge_gain"), no_effect)
+    tried = []
+    monkeypatch.setattr(search, "fit_one_more_effect", lambda fit, added: tried.append((fit, added)) or [])
+    for effect in search.effects:
+        candidate = Candidate((EffectTerm(effect, effect.places(problem.setting)[0]),))
+        start = replace(no_effect.point, effect=candidate.start_values())
+        search.record_fit(fit(problem, candidate, start, iterations=0), exact=False)
+    search.fit_effects_at_several_places()
+    added = {base.candidate.identifiers: {effect.identifier for effect in added} for base, added in tried}
+    changes = {"added_mass", "region_stiffness_loss"}
+    assert added[("added_mass",)] == added[("region_stiffness_loss",)] == changes
+    assert added.get(("gauge_gain",), {"gauge_gain"}) == {"gauge_gain"}
 
 
 def test_a_mass_shows_by_its_weight_at_rest(beam_model) -> None:
