@@ -340,7 +340,8 @@ def _best_places(
 
     half_step = SEARCH.coarse_level_step // 2
     coarse_levels = levels[half_step :: SEARCH.coarse_level_step]
-    coarse_points = [points[0] for place in places if (points := points_at(place, coarse_levels))]
+    points_of_places = [points_at(place, coarse_levels) for place in places]
+    coarse_points = [points[0] for points in points_of_places if points]
     objectives = sorted(point.objective for point in coarse_points)
     largest_objective = objectives[: SEARCH.places_with_all_levels][-1]
     best_of_places = []
