@@ -11,6 +11,8 @@ from dataclasses import dataclass, replace
 from itertools import product
 from math import inf, sqrt
 
+from discrepancy.trials_in_motion.effects import EffectLaws
+
 from .estimate import Estimate
 from .force_states import Process
 from .gauss_newton import (
@@ -18,7 +20,6 @@ from .gauss_newton import (
     MOST_ITERATIONS,
     EstimatorStart,
     GaussNewton,
-    HypothesisLaws,
     start_from_estimate,
 )
 from .linearisation import Linearisation
@@ -111,7 +112,7 @@ class MotionEstimator:
             )
         )
 
-    def estimate_from_far(self, laws: HypothesisLaws, start: EstimatorStart) -> Estimate | None:
+    def estimate_from_far(self, laws: EffectLaws, start: EstimatorStart) -> Estimate | None:
         """Return a hypothesis at its most probable values, from values that may be far from them.
 
         Parameters
@@ -136,7 +137,7 @@ class MotionEstimator:
         return self.tune_processes(laws, best_estimate, COARSE_FACTORS)
 
     def estimate_roughly(
-        self, laws: HypothesisLaws, start: EstimatorStart, small_processes: Processes
+        self, laws: EffectLaws, start: EstimatorStart, small_processes: Processes
     ) -> Estimate | None:
         """Return an estimate for a first comparison, after few steps.
 
@@ -177,7 +178,7 @@ class MotionEstimator:
         return best_estimate
 
     def estimate_nearby(
-        self, laws: HypothesisLaws, start: EstimatorStart, speed_window: float
+        self, laws: EffectLaws, start: EstimatorStart, speed_window: float
     ) -> Estimate | None:
         """Return a hypothesis at its most probable values, from values that are near them.
 
@@ -204,7 +205,7 @@ class MotionEstimator:
         next_start = replace(start_from_estimate(tuned_estimate), processes=self.small_processes)
         return _more_probable(tuned_estimate, self.follow_laws(laws, next_start))
 
-    def follow_laws(self, laws: HypothesisLaws, start: EstimatorStart) -> Estimate | None:
+    def follow_laws(self, laws: EffectLaws, start: EstimatorStart) -> Estimate | None:
         """Return an estimate along the motion of the laws alone, with small missing forces.
 
         The missing forces and the motion are estimated in turn, as long as the evidence rises.
@@ -233,7 +234,7 @@ class MotionEstimator:
             start = replace(start_from_estimate(estimate), processes=processes)
         return best_estimate
 
-    def estimate_along_laws(self, laws: HypothesisLaws, start: EstimatorStart) -> Estimate | None:
+    def estimate_along_laws(self, laws: EffectLaws, start: EstimatorStart) -> Estimate | None:
         """Return an estimate along the motion of the laws alone, with given missing forces.
 
         The result is None if the laws are not possible.
@@ -243,7 +244,7 @@ class MotionEstimator:
 
     def polish(
         self,
-        laws: HypothesisLaws,
+        laws: EffectLaws,
         start: EstimatorStart,
         speed_window: float,
         *,
@@ -284,7 +285,7 @@ class MotionEstimator:
         return _more_probable(tuned_estimate, followed_estimate)
 
     def _estimate_with_smaller_forces(
-        self, laws: HypothesisLaws, start: EstimatorStart, speed_window: float
+        self, laws: EffectLaws, start: EstimatorStart, speed_window: float
     ) -> Estimate | None:
         """Return the most probable of several estimates with smaller and smaller missing forces.
 
@@ -337,7 +338,7 @@ class MotionEstimator:
 
     def tune_processes(
         self,
-        laws: HypothesisLaws,
+        laws: EffectLaws,
         estimate: Estimate,
         factors: Sequence[float] = PATTERN_FACTORS,
         repetitions: int = MOST_REPETITIONS,

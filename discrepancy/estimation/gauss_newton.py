@@ -7,22 +7,16 @@ linearised along the motion that the laws alone give (shooting). The innovations
 evidence by Laplace's approximation.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from math import inf
-from typing import Protocol
 
 import numpy as np
 
 from discrepancy.campaign.records import FloatArray
 from discrepancy.fits.candidate import Candidate
-from discrepancy.trials_in_motion.laws import LawForce
-from discrepancy.trials_in_motion.trajectory import (
-    LawArguments,
-    LinearisedForce,
-    LinearisedSensorErrors,
-    Trajectory,
-)
+from discrepancy.trials_in_motion.effects import EffectLaws
+from discrepancy.trials_in_motion.trajectory import LawArguments, Trajectory
 from discrepancy.trials_in_motion.trial_at_rest import LinearTrial
 
 from .estimate import Estimate
@@ -46,86 +40,6 @@ SHORTEST_FRACTION = 0.1
 """Fraction of a step below which an iteration along the motion of laws ends."""
 LONGEST_STEP = 2.0
 """Longest step of the unknown of an effect, in prior standard deviations."""
-
-
-class HypothesisLaws(Protocol):
-    """The laws and sensor errors of a hypothesis, as the estimator needs them."""
-
-    @property
-    def candidate(self) -> Candidate:
-        """The effects of the hypothesis; their E parameters have a standard normal prior."""
-
-    @property
-    def hold_at_rest(self) -> bool:
-        """Whether a law has a force at rest that may hold a body, as dry friction does."""
-
-    def linearise_along_trajectory(
-        self, arguments: LawArguments
-    ) -> tuple[Mapping[int, LinearisedForce], LinearisedSensorErrors] | None:
-        """Return forces at ports and changes of readings along a trajectory, and derivatives.
-
-        Parameters
-        ----------
-        arguments : LawArguments
-            The trial, its motion, and the values of unknowns.
-
-        Returns
-        -------
-        (mapping of int to LinearisedForce, LinearisedSensorErrors) or None
-            The forces by the index of the port, and the changes of the readings; None if an effect
-            is not possible at these values.
-        """
-
-    def forces_along_trajectory(self, arguments: LawArguments) -> Mapping[int, LawForce] | None:
-        """Return the forces of all laws at ports along a trajectory, not their derivatives.
-
-        Parameters
-        ----------
-        arguments : LawArguments
-            The trial, its motion, and the values of unknowns.
-
-        Returns
-        -------
-        mapping of int to LawForce or None
-            The forces by the index of the port; None if an effect is not possible at these values.
-        """
-
-    def motion_under_laws(
-        self, arguments: LawArguments, local_values: FloatArray
-    ) -> Trajectory | None:
-        """Return the motion of a trial under all laws, without missing forces.
-
-        Parameters
-        ----------
-        arguments : LawArguments
-            The trial, the values of unknowns, and a motion that begins in the same state.
-        local_values : (L,) array
-            The values of the unknowns of this trial alone.
-
-        Returns
-        -------
-        Trajectory or None
-            The motion; None if an effect is not possible at these values.
-        """
-
-    def residual_of_simulation(
-        self, arguments: LawArguments, local_values: FloatArray
-    ) -> FloatArray | None:
-        """Return the residuals of a trial that is simulated under all laws.
-
-        Parameters
-        ----------
-        arguments : LawArguments
-            The trial and the values of unknowns.
-        local_values : (L,) array
-            The values of the unknowns of this trial alone.
-
-        Returns
-        -------
-        (N, C) array or None
-            The readings minus the prediction, divided by the noise; None if an effect is not
-            possible at these values.
-        """
 
 
 @dataclass(frozen=True, eq=False)
@@ -170,7 +84,7 @@ def start_from_estimate(estimate: Estimate) -> EstimatorStart:
 
 
 def linearise_trials(
-    laws: HypothesisLaws,
+    laws: EffectLaws,
     trials: Sequence[LinearTrial],
     start: EstimatorStart,
     speed_window: float,
@@ -213,7 +127,7 @@ def linearise_trials(
 
 
 def linearise_along_laws(
-    laws: HypothesisLaws,
+    laws: EffectLaws,
     trials: Sequence[LinearTrial],
     start: EstimatorStart,
     speed_window: float,
@@ -262,7 +176,7 @@ def linearise_along_laws(
 
 
 def _start_after_step(
-    laws: HypothesisLaws, start: EstimatorStart, estimate: Estimate, fraction: float
+    laws: EffectLaws, start: EstimatorStart, estimate: Estimate, fraction: float
 ) -> EstimatorStart:
     """Return the values and trajectories a fraction of the way from a start to an estimate.
 
@@ -320,7 +234,7 @@ class GaussNewton:
     prior_medians: Processes
 
     def linearise(
-        self, laws: HypothesisLaws, start: EstimatorStart, speed_window: float
+        self, laws: EffectLaws, start: EstimatorStart, speed_window: float
     ) -> Linearisation | None:
         """Return `linearise_trials` of these trials."""
         return linearise_trials(laws, self.trials, start, speed_window, self.shared_priors)
@@ -332,7 +246,7 @@ class GaussNewton:
     @np.errstate(over="ignore", invalid="ignore")  # a motion that diverges is rejected
     def iterate(
         self,
-        laws: HypothesisLaws,
+        laws: EffectLaws,
         start: EstimatorStart,
         speed_window: float,
         most_iterations: int = MOST_ITERATIONS,
@@ -387,7 +301,7 @@ class GaussNewton:
     @np.errstate(over="ignore", invalid="ignore")  # a motion that diverges is rejected
     def iterate_along_laws(
         self,
-        laws: HypothesisLaws,
+        laws: EffectLaws,
         start: EstimatorStart,
         speed_window: float,
         most_iterations: int = MOST_ITERATIONS,
@@ -509,7 +423,7 @@ class GaussNewton:
 
     def _take_step(
         self,
-        laws: HypothesisLaws,
+        laws: EffectLaws,
         current_start: EstimatorStart,
         estimate: Estimate,
         linearisation: Linearisation,
@@ -540,7 +454,7 @@ class GaussNewton:
 
     def _linearisation_error(
         self,
-        laws: HypothesisLaws,
+        laws: EffectLaws,
         current_start: EstimatorStart,
         stepped_start: EstimatorStart,
         linearisation: Linearisation,

@@ -75,7 +75,8 @@ class EffectLaws:
     ) -> tuple[Mapping[int, LinearisedForce], LinearisedSensorErrors] | None:
         """Return forces at ports and changes of readings along a trajectory, and derivatives.
 
-        See `HypothesisLaws.linearise_along_trajectory`.
+        The forces are those of all laws, by the index of the port. The result is None if an effect
+        is not possible at these values.
         """
         try:
             forces = self._linearised_forces(arguments)
@@ -84,9 +85,9 @@ class EffectLaws:
             return None
 
     def forces_along_trajectory(self, arguments: LawArguments) -> Mapping[int, LawForce] | None:
-        """Return the forces of all laws at ports along a trajectory, not their derivatives.
+        """Return the forces of all laws along a trajectory, by the index of the port.
 
-        See `HypothesisLaws.forces_along_trajectory`.
+        The result is None if an effect is not possible at these values.
         """
         try:
             return self._forces_of_patch(arguments, self._patch_of_all_laws(arguments))
@@ -98,7 +99,9 @@ class EffectLaws:
     ) -> Trajectory | None:
         """Return the motion of a trial under all laws, without missing forces.
 
-        See `HypothesisLaws.motion_under_laws`.
+        The trajectory of the arguments begins in the same state. `local_values` (L,) are the
+        unknowns of the trial alone. The result is None if an effect is not possible at these
+        values.
         """
         try:
             laws = self._laws_in_patch(self._patch_of_all_laws(arguments))
@@ -129,7 +132,9 @@ class EffectLaws:
     ) -> FloatArray | None:
         """Return the residuals (N, C) of a trial that is simulated under all laws.
 
-        See `HypothesisLaws.residual_of_simulation`.
+        They are the readings minus the prediction, divided by the noise; `local_values` (L,) are
+        the unknowns of the trial alone. The result is None if an effect is not possible at these
+        values.
         """
         trial = self.trials[arguments.trial_index]
         trial_index = self.trial_indices[arguments.trial_index]
