@@ -1,7 +1,7 @@
 """Remarks beside a verdict: strained priors, and effects that were not tested or fitted."""
 
 from collections.abc import Sequence
-from math import isnan, nan
+from math import isnan, nan, pi
 
 from discrepancy.catalogue.entry import Effect, Setting
 from discrepancy.catalogue.needs import NO_PORT
@@ -10,6 +10,8 @@ from discrepancy.fits.problem import Problem
 from discrepancy.search.strategy import Search
 from discrepancy.search_settings import SEARCH
 from discrepancy.system.lumped_model import LumpedModel
+from discrepancy.system.structures import StructureModel
+from discrepancy.system.system_state import SystemState
 from discrepancy.verdict import NotFitted
 from reporting.words import listing
 
@@ -57,6 +59,27 @@ def missing_port_remark(setting: Setting, effects: Sequence[Effect]) -> list[str
         f"Not tested for lack of a port: {listing(names)}; declare a [[port]] in the model's "
         f"file{example} where such a force may act."
     ]
+
+
+def left_out_modes_remark(problem: Problem) -> str | None:
+    """Return the remark that records show higher modes than a reduced model has; None otherwise.
+
+    Motion in modes that are left out follows the loads at once, where the structure rings.
+    """
+    model = problem.model
+    intervals = [data.trial.interval for data in problem.trials if data.trial.is_dynamic]
+    if not isinstance(model, StructureModel) or not intervals:
+        return None
+    state = SystemState(tuple(model.prior_mean().tolist()))
+    frequencies = model.build_system(state).angular_frequency / (2.0 * pi)
+    shown_frequency = 0.5 / min(intervals)
+    if shown_frequency <= frequencies.max():
+        return None
+    return (
+        f"The reduced model has {len(frequencies)} modes up to {frequencies.max():.4g} Hz, and the "
+        f"records show frequencies up to {shown_frequency:.4g} Hz: if higher modes ring in them, "
+        "state more modes in [reduction] of the structure file."
+    )
 
 
 def effects_not_fitted(

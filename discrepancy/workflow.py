@@ -59,6 +59,7 @@ from discrepancy.verdict import Experiment, GapWindow, Verdict, VerdictKind, eff
 from discrepancy.verdict_remarks import (
     effects_not_fitted,
     implausible_value_remarks,
+    left_out_modes_remark,
     missing_port_remark,
 )
 from fe.runtime.patch import ModelPatch
@@ -346,6 +347,10 @@ def _remarks(
     look_alikes = look_alike_remark(verdict, search.effects)
     if look_alikes is not None:
         remarks.append(look_alikes)
+    if verdict.kind is VerdictKind.UNEXPLAINED:
+        left_out_modes = left_out_modes_remark(problem)
+        if left_out_modes is not None:
+            remarks.append(left_out_modes)
     if len(problem.model.parameters) == len(problem.model.nuisance_parameters):
         remarks.append(
             f"The model {problem.model.name!r} has no uncertain parameter, so that a small error "

@@ -439,9 +439,11 @@ class Search(FittedCandidates):
                 for fit in (*self.exact_fits.values(), *self.rough_fits.values())
                 if [term.effect.identifier for term in fit.candidate.terms] == [effect.identifier]
             ]
-            if not single_fits:
+            current_fit = max(single_fits, key=self.score, default=self.no_effect)
+            if not current_fit.candidate.terms or (
+                mesh_changes and self.score(current_fit) < self.score(self.no_effect)
+            ):
                 continue
-            current_fit = max(single_fits, key=self.score)
             while len(current_fit.candidate.terms) < SEARCH.largest_set:
                 current_score = self.score(current_fit)
                 rough_fits = self.fit_one_more_effect(current_fit, added_effects)

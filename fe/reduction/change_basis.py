@@ -65,6 +65,10 @@ LEAST_LOSS_REMAINDER = 1e-3
 """The same as `LEAST_REMAINDER` for changes of solutions by a loss, relative to the solutions."""
 LARGEST_MASS_GAIN = 0.5
 """Mass with which the errors are measured: the largest relative gain of a modal mass."""
+LARGEST_ERROR = 1e-3
+"""Largest relative error under a change; above it, the columns of this change are refined again."""
+MOST_REFINEMENTS = 3
+"""Most refinements of the columns of a change."""
 DIAGONAL = 0.7
 """Distance along and across a location at which the errors are measured, too, over its reach."""
 LOSS_RANGE = (0.05, 0.7)
@@ -76,6 +80,9 @@ under a load or in a mode."""
 
 def with_changes(yielding: AffineStructure, reduction: Reduction) -> ChangeableModel:
     """Extend a reduced model by the columns that changes of the structure need.
+
+    The columns of a change are refined until its largest error is below `LARGEST_ERROR`, at most
+    `MOST_REFINEMENTS` times.
 
     Parameters
     ----------
@@ -97,12 +104,18 @@ def with_changes(yielding: AffineStructure, reduction: Reduction) -> ChangeableM
     for patch in columns.loss_places:
         columns.add_loss(patch)
     model = columns.model()
-    for number in range(len(model.change_errors)):
-        columns.refine(model, number)
-    model = columns.model()
-    errors = [columns.error(model, number) for number in range(len(model.change_errors))]
+    coarse = list(range(len(model.change_errors)))
+    errors = np.full(len(coarse), np.inf)
+    for _ in range(MOST_REFINEMENTS):
+        for number in coarse:
+            columns.refine(model, number)
+        model = columns.model()
+        errors[coarse] = [columns.error(model, number) for number in coarse]
+        coarse = np.flatnonzero(errors > LARGEST_ERROR).tolist()
+        if not coarse:
+            break
     values = {field.name: getattr(model, field.name) for field in fields(ChangeableModel)}
-    return ChangeableModel(**values | {"change_errors": np.array(errors, dtype=np.float64)})
+    return ChangeableModel(**values | {"change_errors": errors})
 
 
 class _Columns:

@@ -77,7 +77,7 @@ def reduce_structure(
     progress = reporter(progress)
     if settings is None:
         limits = structure.design.reduction
-        settings = StructureSettings(limits.tolerance, limits.most_solutions)
+        settings = StructureSettings(limits.tolerance, limits.most_solutions, limits.modes)
     terms = ReductionTerms(replace(structure, ranges=structure.ranges | settings.ranges))
     _check_reducible(terms)
     with progress.stage("Factorising the structure"):

@@ -210,6 +210,8 @@ class ReductionLimits(DesignSection):
     """Largest error of the reduced model, as a fraction of the largest output [1]."""
     most_solutions: int = Field(default=401, ge=1, le=2000)
     """Largest number of solutions of the full model that the reduction may take."""
+    modes: int = Field(default=6, ge=1, le=50)
+    """Number of modes of the reduced model; motion in higher ones follows the loads at once."""
 
 
 class StructureDesign(DesignSection):
@@ -373,5 +375,5 @@ class StructureSettings:
 
     bound_tolerance: float = ReductionLimits().tolerance
     most_snapshots: int = ReductionLimits().most_solutions
-    mode_count: int = 6
+    mode_count: int = ReductionLimits().modes
     ranges: dict[str, tuple[float, float]] = field(default_factory=dict)
