@@ -102,53 +102,37 @@ def _write_group(target: h5py.Group, group: NetcdfGroup) -> None:
     Each axis is an HDF5 dimension scale, which is attached to the variables that have this axis.
     """
     target.attrs.update(group.attrs)
-    axis_sizes = _axis_sizes(group)
+    entries = {**group.variables, **group.coords}
+    axis_sizes: dict[str, int] = {}
+    for entry in entries.values():
+        axis_sizes.update(zip(entry.dims, entry.values.shape, strict=True))
+
+    # The axes, with their labels or by their size alone
     for axis, size in axis_sizes.items():
-        _write_axis(target, group, axis, size)
-    for name, variable in {**group.variables, **group.coords}.items():
+        if axis in entries:
+            _write_variable(target, axis, entries[axis]).make_scale(axis)
+            continue
+        unlabelled = target.create_dataset(axis, (size,), ">f4", track_order=True)
+        # The NetCDF library recognises an axis without labels by this text.
+        scale_name = f"This is a netCDF dimension but not a netCDF variable.{size:10}"
+        unlabelled.make_scale(scale_name.encode("ascii"))
+
+    # All else. By the CF conventions, the attribute "coordinates" of a variable names those of its
+    # coordinates that are not labels of a whole axis.
+    for name, entry in entries.items():
         if name in axis_sizes:
             continue
-        dataset = _write_variable(target, name, variable)
-        for number, axis in enumerate(variable.dims):
+        dataset = _write_variable(target, name, entry)
+        for number, axis in enumerate(entry.dims):
             dataset.dims[number].attach_scale(target[axis])
-        if name in group.variables:
-            coordinates = _further_coordinates(group, variable)
-            if coordinates:
-                dataset.attrs["coordinates"] = " ".join(coordinates)
-
-
-def _axis_sizes(group: NetcdfGroup) -> dict[str, int]:
-    """Return the size of each axis of a group, by name, in the order of first use."""
-    sizes = {}
-    for variable in {**group.variables, **group.coords}.values():
-        for axis, size in zip(variable.dims, variable.values.shape, strict=True):
-            sizes[axis] = size
-    return sizes
-
-
-def _write_axis(target: h5py.Group, group: NetcdfGroup, axis: str, size: int) -> None:
-    """Write an axis with its labels, or by its size alone if it has none."""
-    labels = {**group.variables, **group.coords}.get(axis)
-    if labels is not None:
-        _write_variable(target, axis, labels).make_scale(axis)
-        return
-    unlabelled = target.create_dataset(axis, (size,), ">f4", track_order=True)
-    # The NetCDF library recognises an axis without labels by this text.
-    scale_name = f"This is a netCDF dimension but not a netCDF variable.{size:10}"
-    unlabelled.make_scale(scale_name.encode("ascii"))
-
-
-def _further_coordinates(group: NetcdfGroup, variable: Variable) -> list[str]:
-    """Return the names of a variable's coordinates that are not labels of a whole axis.
-
-    The attribute "coordinates" of the variable lists them, as the CF conventions prescribe.
-    """
-    axis_sizes = _axis_sizes(group)
-    return [
-        name
-        for name, coordinate in group.coords.items()
-        if name not in axis_sizes and set(coordinate.dims) <= set(variable.dims)
-    ]
+        if name in group.coords:
+            continue
+        coordinates = []
+        for label, coordinate in group.coords.items():
+            if label not in axis_sizes and set(coordinate.dims) <= set(entry.dims):
+                coordinates.append(label)
+        if coordinates:
+            dataset.attrs["coordinates"] = " ".join(coordinates)
 
 
 def _write_variable(target: h5py.Group, name: str, variable: Variable) -> h5py.Dataset:

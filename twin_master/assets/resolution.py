@@ -9,7 +9,6 @@ from typing import Literal, TypeAlias
 from pydantic import ConfigDict, Field
 
 from reporting.formats.toml_file import read_toml, validate
-from reporting.json_file import JsonRecord
 from reporting.words import comma_list
 from twin_master.assets.asset_source import NO_ASSET, AssetSource, PairedSource, WatchedSource
 from twin_master.assets.parameter import is_of_parameters
@@ -378,7 +377,14 @@ def apply_learnt(table: Table, path: Path, group: str | None = None) -> None:
     )
     learnt = learnt_file.tables_of_group(group)
     if learnt.get("transition"):
-        _check_learnt_transition(table, learnt["transition"], path)
+        learnt_controls = learnt["transition"].get("probability", {})
+        controls = sorted(control["name"] for control in table["control"])
+        kind = table["transition"]["kind"]
+        if sorted(learnt_controls) != controls or kind != "independent_worsening":
+            raise MissionInputError(
+                f"{path} has probabilities for {comma_list(learnt_controls)}, but the scenario has "
+                f"the controls {comma_list(controls)} and transitions of the kind {kind}."
+            )
         truth = table["truth"]
         if truth["kind"] == "random_growth" and not truth["probability"]:
             # Without probabilities of its own the truth has those of the twin. It keeps the ones
@@ -386,31 +392,13 @@ def apply_learnt(table: Table, path: Path, group: str | None = None) -> None:
             truth["probability"] = table["transition"]["probability"]
     if learnt.get("calibration"):
         learnt_parameter = learnt["calibration"].get("parameter")
-        table["calibration"] = _normal_calibration(table["calibration"], learnt_parameter, path)
+        calibration = table["calibration"]
+        if learnt_parameter != calibration["parameter"]:
+            raise MissionInputError(
+                f"{path} has learnt {learnt_parameter}, and the parameter of the scenario is "
+                f"{calibration['parameter']}."
+            )
+        kept_keys = {"draws": calibration["draws"], "file": calibration["file"]}
+        table["calibration"] = {**kept_keys, "source": "normal"}
     for name, learnt_table in learnt.items():
         table[name] |= learnt_table  # its keys replace those of the scenario
-
-
-def _check_learnt_transition(table: JsonRecord, transition: JsonRecord, path: Path) -> None:
-    """Refuse learnt probabilities that do not fit the controls and transitions of a scenario."""
-    learnt_controls = transition.get("probability", {})
-    controls = sorted(control["name"] for control in table["control"])
-    kind = table["transition"]["kind"]
-    if sorted(learnt_controls) != controls or kind != "independent_worsening":
-        raise MissionInputError(
-            f"{path} has probabilities for {comma_list(learnt_controls)}, but the scenario has the "
-            f"controls {comma_list(controls)} and transitions of the kind {kind}."
-        )
-
-
-def _normal_calibration(calibration: JsonRecord, learnt_parameter: object, path: Path) -> Table:
-    """Return the table `calibration` for a normal distribution; the caller adds learnt keys.
-
-    A learnt parameter other than that of the scenario is refused.
-    """
-    if learnt_parameter != calibration["parameter"]:
-        raise MissionInputError(
-            f"{path} has learnt {learnt_parameter}, and the parameter of the scenario is "
-            f"{calibration['parameter']}."
-        )
-    return {"draws": calibration["draws"], "file": calibration["file"], "source": "normal"}

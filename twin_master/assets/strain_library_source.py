@@ -14,7 +14,7 @@ from typing import ClassVar, Literal
 import numpy as np
 
 from reporting.arrays import Float
-from reporting.json_file import JsonDocument, JsonRecord, read_json
+from reporting.json_file import JsonRecord, read_json
 from reporting.words import comma_list
 from twin_master.assets.asset_source import (
     LIBRARY_COPY,
@@ -163,7 +163,8 @@ def _parse_library(content: JsonRecord) -> StrainLibrary:
     rows = []
     for draw, z1, z2, control in product((_MEAN_ENTRY, *draws), *levels_by_region, controls):
         row = observations[str(z1)][str(z2)][control][draw]
-        if not _is_finite_vector(row, gauge_count):
+        has_gauges = np.shape(row) == (gauge_count,)
+        if not has_gauges or not np.all(np.isfinite(np.asarray(row, dtype=np.float64))):
             raise ValueError(
                 f"observations[{z1}][{z2}][{control}][{draw}] must hold {gauge_count} finite "
                 "strains"
@@ -183,13 +184,6 @@ def _parse_library(content: JsonRecord) -> StrainLibrary:
         strain_per_draw=table[1:],
         strain=table[0],
     )
-
-
-def _is_finite_vector(row: JsonDocument, length: int) -> bool:
-    """Return whether a row of the file is a list of `length` finite numbers."""
-    if np.shape(row) != (length,):
-        return False
-    return bool(np.all(np.isfinite(np.asarray(row, dtype=np.float64))))
 
 
 class StrainLibrarySection(AssetSection):

@@ -133,7 +133,12 @@ def parse_grid(texts: Sequence[str], binding: Binding) -> dict[str, dict[str, tu
     values_by_role: dict[str, dict[str, tuple[float, ...]]] = {role: {} for role in _ROLES}
     for text in texts:
         name, equals_sign, values_text = text.partition("=")
-        matches = _matching_inputs(name, binding)
+        # NAME, or ROLE.NAME
+        role, _, inner_name = name.partition(".")
+        if role in _ROLES and inner_name in getattr(binding, role):
+            matches = [(role, inner_name)]
+        else:
+            matches = [(role, name) for role in _ROLES if name in getattr(binding, role)]
         if not equals_sign or not matches:
             known_names = [f"{role}.{key}" for role in _ROLES for key in getattr(binding, role)]
             raise MissionInputError(
@@ -146,14 +151,6 @@ def parse_grid(texts: Sequence[str], binding: Binding) -> dict[str, dict[str, tu
         role, key = matches[0]
         values_by_role[role][key] = _parse_values(values_text, text)
     return values_by_role
-
-
-def _matching_inputs(name: str, binding: Binding) -> list[tuple[str, str]]:
-    """Return role and name of each input of a binding that NAME or ROLE.NAME can mean."""
-    role, _, inner_name = name.partition(".")
-    if role in _ROLES and inner_name in getattr(binding, role):
-        return [(role, inner_name)]
-    return [(role, name) for role in _ROLES if name in getattr(binding, role)]
 
 
 def _parse_values(values_text: str, text: str) -> tuple[float, ...]:
@@ -215,6 +212,11 @@ def grid_of_fmu(
                 "one with --role."
             )
         role = next(iter(binding.observation))
+    for name, values in values_by_role["load"].items():
+        if len(values) > 1:
+            raise MissionInputError(
+                f"the load {name} can have one value, but {len(values)} were given."
+            )
     parameters = values_by_role["parameter"]
     swept_parameters = [name for name, values in parameters.items() if len(values) > 1]
     if len(swept_parameters) > 1:
@@ -234,7 +236,7 @@ def grid_of_fmu(
         controls=(
             _combined_controls(values_by_role["control"]) if binding.control else {"none": {}}
         ),
-        load=_single_loads(values_by_role["load"]),
+        load={name: values[0] for name, values in values_by_role["load"].items()},
         parameters={name: values[0] for name, values in parameters.items()},
         settling_steps=settling_steps,
         step_timeout=binding.limits.step_time or STEP_TIMEOUT,
@@ -259,16 +261,6 @@ def _combined_controls(
         name = ", ".join(f"{key} = {value:g}" for key, value in control.items())
         controls[name] = control
     return controls
-
-
-def _single_loads(loads: Mapping[str, tuple[float, ...]]) -> dict[str, float]:
-    """Return the one value of each load input; refuse a load with several values."""
-    for name, values in loads.items():
-        if len(values) > 1:
-            raise MissionInputError(
-                f"the load {name} can have one value, but {len(values)} were given."
-            )
-    return {name: values[0] for name, values in loads.items()}
 
 
 def grid_of_scenario(

@@ -130,7 +130,12 @@ def sample_library(
         {f"{sensor_count} sensors at {grid.size} points": size},
         "take fewer levels, draws or controls",
     )
-    record = _library_record(grid)
+    # What determines the library: the grid, but for the time limit, the files and the version.
+    record: JsonObject = json.loads(json.dumps(asdict(grid)))
+    del record["step_timeout"]
+    record["fmu"] = hash_file(Path(grid.fmu))
+    record["binding"] = hash_file(Path(grid.binding))
+    record["version"] = version("uav-twin")
     folder = _prepare_folder(out, record, resume=resume, replace_existing=replace_existing)
     lock = lock_folder(folder)
     if lock is None:
@@ -221,19 +226,6 @@ def _check_grid(grid: SamplingGrid, binding: Binding) -> None:
     for name, levels in grid.states.items():
         if any(second <= first for first, second in itertools.pairwise(levels)):
             raise MissionInputError(f"the levels of {name} must increase, but {levels} was given.")
-
-
-def _library_record(grid: SamplingGrid) -> JsonObject:
-    """Return everything that determines a library: the grid, the hashes of the files, the version.
-
-    The time limit of a step is left out, as it has no influence.
-    """
-    record: JsonObject = json.loads(json.dumps(asdict(grid)))
-    del record["step_timeout"]
-    record["fmu"] = hash_file(Path(grid.fmu))
-    record["binding"] = hash_file(Path(grid.binding))
-    record["version"] = version("uav-twin")
-    return record
 
 
 def _prepare_folder(out: Path, record: JsonObject, *, resume: bool, replace_existing: bool) -> Path:

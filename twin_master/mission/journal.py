@@ -12,14 +12,12 @@ records, with the large parts if the line or these files contain them.
 
 import base64
 import io
-import json
 import math
 import os
 import time
 import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from hashlib import sha256
 from pathlib import Path
 from typing import BinaryIO, NamedTuple, Self
 
@@ -30,6 +28,7 @@ from reporting.files import explained_write_errors, synchronise, write_at, write
 from reporting.formats.former_names import with_present_names
 from reporting.json_file import JsonObject, JsonRecord, plain
 from twin_master.errors import NotResumableError
+from twin_master.mission import recent_parts
 from twin_master.mission.journal_packing import (
     array_from_json,
     full_record,
@@ -38,7 +37,7 @@ from twin_master.mission.journal_packing import (
     rounded,
     rounded_probabilities,
 )
-from twin_master.mission.recent_parts import RecentParts, RecentPartsFile
+from twin_master.mission.recent_parts import HASH_LENGTH, RecentParts, RecentPartsFile
 from twin_master.mission.steps import GroundTruth, MissionStep, Reading
 
 JOURNAL_NAME = "journal.jsonl"
@@ -62,14 +61,11 @@ PRESENT_NAMES = {
     "standing.teaching.adopted.from_turn": "from_step",
 }
 """The present name of each renamed key, by the path of its former name in a record."""
-_HASH_LENGTH = 64
-"""Characters of a SHA-256 hash in hexadecimal digits."""
 _BLOCK_SIZE = 1_000_000
 """Bytes that are read at once from the end of a journal."""
 _WRONG_HASH = "its hash does not fit its content"
 JOURNAL_FORMAT = 2
 """Version of the format, in the first line; the first version did not write it."""
-_ENCODER = json.JSONEncoder(sort_keys=True, allow_nan=False, separators=(",", ":"))
 
 
 class JournalLine(NamedTuple):
@@ -216,15 +212,6 @@ def with_short_truth(record: JsonObject, noise_free: NoiseFree) -> JsonObject:
     return remaining_record | {"observation_difference": difference}
 
 
-def _true_observation(record: JsonObject, observed: Float, noise_free: NoiseFree | None) -> Float:
-    """Return the observation (G,) without noise in a record, to the bit."""
-    if "observation" in record or noise_free is None:
-        return array_from_json(record["observation"])
-    difference = np.array(record["observation_difference"], dtype=np.int64)
-    estimate = noise_free(record["step"], observed[: len(difference)])
-    return (estimate.view(np.int64) + difference).view(np.float64)
-
-
 def reading_from_line(record: JsonObject, noise_free: NoiseFree | None = None) -> Reading:
     """Return the reading in a record of the journal, with the ground truth of a simulated asset.
 
@@ -242,9 +229,15 @@ def reading_from_line(record: JsonObject, noise_free: NoiseFree | None = None) -
     ground_truth = None
     if "monitors" in record:
         values = array_from_json(record["monitors"].values()).tolist()
+        if "observation" in record or noise_free is None:
+            true_observation = array_from_json(record["observation"])
+        else:
+            difference = np.array(record["observation_difference"], dtype=np.int64)
+            estimate = noise_free(record["step"], observed_values[: len(difference)])
+            true_observation = (estimate.view(np.int64) + difference).view(np.float64)
         ground_truth = GroundTruth(
             state=array_from_json(record["state"]),
-            observation=_true_observation(record, observed_values, noise_free),
+            observation=true_observation,
             monitors=dict(zip(record["monitors"], values, strict=True)),
         )
     return Reading(observed_values, int(record["control_index"]), ground_truth=ground_truth)
@@ -332,9 +325,9 @@ class JournalFile:
         line = encode_line(record)
         try:
             if parts:
-                self.recent.append(int(str(record["step"])), line[:_HASH_LENGTH], parts)
+                self.recent.append(int(str(record["step"])), line[:HASH_LENGTH], parts)
             else:
-                self.recent.pass_over(line[:_HASH_LENGTH])
+                self.recent.pass_over(line[:HASH_LENGTH])
             write_at(self.path, line, self.size)
             if time.monotonic() - self._flushed_at >= self._flush_seconds:
                 self.flush()
@@ -353,8 +346,7 @@ class JournalFile:
 
 def encode_line(record: Mapping[str, object]) -> bytes:
     """Return a record as a line of the journal: hash, blank, JSON, line feed."""
-    text = _ENCODER.encode(packed_record(record)).encode("ascii")
-    return sha256(text).hexdigest().encode("ascii") + b" " + text + b"\n"
+    return recent_parts.encode_line(packed_record(record))
 
 
 def _header(config_hash: str) -> JsonObject:
@@ -443,12 +435,8 @@ def record_of_line(line: bytes, path: Path, recent: RecentParts | None = None) -
     NotResumableError
         If the line is the first one of a journal that a later version wrote.
     """
-    line_hash = line[:_HASH_LENGTH]
-    text = line[_HASH_LENGTH + 1 :].rstrip(b"\n")
-    if sha256(text).hexdigest().encode("ascii") != line_hash:
-        return None
-    record = json.loads(text)
-    if not isinstance(record, dict):
+    record = recent_parts.decode_line(line)
+    if record is None:
         return None
     if record.get("format", JOURNAL_FORMAT) != JOURNAL_FORMAT:
         raise NotResumableError(
@@ -459,7 +447,7 @@ def record_of_line(line: bytes, path: Path, recent: RecentParts | None = None) -
     if "turn" in record:
         return with_present_names(record, PRESENT_NAMES, str(path), NotResumableError)
     record = full_record(record)
-    return record if recent is None else recent.complete(record, line_hash)
+    return record if recent is None else record | recent.parts_of(line[:HASH_LENGTH])
 
 
 def records_backwards(
@@ -555,29 +543,19 @@ def damaged_line_error(path: Path, begin: int, reason: str) -> NotResumableError
     line_number = 1
     undamaged_lines_before = 0
     undamaged_lines_after = 0
-    # A line that matches its hash is undamaged.
+    position = 0
     with path.open("rb") as file:
-        for line in _lines_before(file, begin):
-            line_number += 1
-            if record_of_line(line, path) is not None:
-                undamaged_lines_before += 1
-        file.readline()  # the damaged line itself
         for line in file:
-            if record_of_line(line, path) is not None:
+            is_undamaged = record_of_line(line, path) is not None  # it matches its hash
+            if position < begin:
+                line_number += 1
+            if is_undamaged and position < begin:
+                undamaged_lines_before += 1
+            elif is_undamaged and position > begin:
                 undamaged_lines_after += 1
+            position += len(line)
     return NotResumableError(
         f"line {line_number} of the journal {path} was changed or is damaged ({reason}); "
         f"{undamaged_lines_before} before it and {undamaged_lines_after} after it are valid: begin "
         "again with --replace."
     )
-
-
-def _lines_before(file: BinaryIO, end: int) -> Iterator[bytes]:
-    """Yield the lines of a file that begin before byte `end`, and leave the file after them."""
-    position = 0
-    while position < end:
-        line = file.readline()
-        if not line:
-            return
-        position += len(line)
-        yield line

@@ -249,7 +249,7 @@ class DamageGrowth:
     def __init__(self, model: GraphicalModel) -> None:
         self._model = model
         self._initial = _possible_states(model.prior)
-        self._next_states: dict[tuple[int, int], _NextStates] = {}
+        self._next_states: dict[int, _NextStates] = {}  # by the codes of `next_states`
 
     def next_states(self, control: Index | None, state: Index | None, uniform: Float) -> Index:
         """Draw the indices (...) of the states that follow states under controls.
@@ -271,16 +271,11 @@ class DamageGrowth:
         pair_codes = control * self._model.states.size + state
         for pair_code in np.unique(pair_codes).tolist():
             has_code = pair_codes == pair_code
-            next_states[has_code] = _draw(self._states_after(pair_code), uniform[has_code])
+            if pair_code not in self._next_states:
+                row = self._model.transition.row(*divmod(pair_code, self._model.states.size))
+                self._next_states[pair_code] = _possible_states(row)
+            next_states[has_code] = _draw(self._next_states[pair_code], uniform[has_code])
         return next_states
-
-    def _states_after(self, code: int) -> _NextStates:
-        """Return the possible next states of a pair, coded as control * S + state."""
-        control, state = divmod(code, self._model.states.size)
-        if (control, state) not in self._next_states:
-            probability = self._model.transition.row(control, state)
-            self._next_states[control, state] = _possible_states(probability)
-        return self._next_states[control, state]
 
 
 def _possible_states(probability: Float) -> _NextStates:
@@ -452,8 +447,15 @@ class Plant(Source[DecidingTwins]):
         if sensed is None:
             sensed = self._truth.sense(self.step, observation, self._sensed)
         if self._truth.in_asset:
-            values = np.stack([self._state_in_asset(reading) for reading in readings])[group]
-            state = TrueState(state.state_index, values)
+            rows = []
+            for reading in readings:
+                if reading.state is None:
+                    raise MissionInputError(
+                        f"step {self.step}: the asset does not report its damage, which the table "
+                        "`truth` requires"
+                    )
+                rows.append([reading.state[name] for name in self._scenario.state_names])
+            state = TrueState(state.state_index, np.array(rows)[group])
         inspected = self._truth.inspect(self.step, state.values, control)
         self._state = state
         self._sensed = sensed
@@ -522,15 +524,6 @@ class Plant(Source[DecidingTwins]):
                 f"{numbers} under the control `{control}`; the run stops here and can be resumed"
             )
         return values
-
-    def _state_in_asset(self, reading: AssetReading) -> Float:
-        """Return the true state factors (F,) that an asset with damage of its own reports."""
-        if reading.state is None:
-            raise MissionInputError(
-                f"step {self.step}: the asset does not report its damage, which the table `truth` "
-                "requires"
-            )
-        return np.array([reading.state[name] for name in self._scenario.state_names])
 
     def noise_free(self, step: int, sensed: Float) -> Float:
         """Return sensed values (G,) without noise and drift, see `Truth.noise_free`."""

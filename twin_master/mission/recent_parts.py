@@ -26,7 +26,8 @@ RECENT_NAMES = ("recent_0.jsonl", "recent_1.jsonl")
 BLOCK_STEPS = 64
 """Number of successive steps whose parts are in one file."""
 _EARLY_STEPS = (1, 4, 16)
-_HASH_LENGTH = 64
+HASH_LENGTH = 64
+"""Characters of a SHA-256 hash in hexadecimal digits."""
 _NAME_OF_LINE = re.compile(rb'"line":"([0-9a-f]{64})"')
 _ENCODER = json.JSONEncoder(sort_keys=True, allow_nan=False, separators=(",", ":"))
 
@@ -40,16 +41,16 @@ def is_whole_step(step: int) -> bool:
     return step % BLOCK_STEPS == 0 or step in _EARLY_STEPS
 
 
-def _encode(parts: Mapping[str, object]) -> bytes:
-    text = _ENCODER.encode(parts).encode("ascii")
+def encode_line(record: Mapping[str, object]) -> bytes:
+    """Return a record as a line of JSON after its hash and a blank, with a line feed."""
+    text = _ENCODER.encode(record).encode("ascii")
     return sha256(text).hexdigest().encode("ascii") + b" " + text + b"\n"
 
 
-def _decode(line: bytes) -> JsonObject | None:
-    """Return the object of a line; None if it is incomplete or does not match its hash."""
-    text = line[_HASH_LENGTH + 1 :].rstrip(b"\n")
-    is_complete = line.endswith(b"\n")
-    if not is_complete or sha256(text).hexdigest().encode("ascii") != line[:_HASH_LENGTH]:
+def decode_line(line: bytes) -> JsonObject | None:
+    """Return the record of a line, with or without its line feed; None if its hash is wrong."""
+    text = line[HASH_LENGTH + 1 :].rstrip(b"\n")
+    if sha256(text).hexdigest().encode("ascii") != line[:HASH_LENGTH]:
         return None
     record = json.loads(text)
     return record if isinstance(record, dict) else None
@@ -64,8 +65,11 @@ def _size_to_keep(path: Path, step: int, line_hash: bytes) -> int:
     size = 0
     with suppress(FileNotFoundError), path.open("rb") as file:
         for line in file:
-            parts = _decode(line)
-            if parts is None or parts["step"] // BLOCK_STEPS != step // BLOCK_STEPS:
+            parts = decode_line(line)
+            is_complete = line.endswith(b"\n")
+            if parts is None or not is_complete:
+                break
+            if parts["step"] // BLOCK_STEPS != step // BLOCK_STEPS:
                 break
             if parts["step"] > step or parts["line"] == line_hash.decode("ascii"):
                 break
@@ -88,22 +92,18 @@ class RecentParts:
         self._versions: list[tuple[int, int, int] | None]  # inode, size and time of change
         self._forget_files()
 
-    def complete(self, record: JsonObject, line_hash: bytes) -> JsonObject:
-        """Return a record of the journal with the parts that its line left out, if there are any.
+    def parts_of(self, line_hash: bytes) -> JsonObject:
+        """Return the parts that a line of the journal left out; empty if the files lack them.
 
         Parameters
         ----------
         line_hash : bytes
-            The hash of its line, in hexadecimal digits.
+            The hash of the line, in hexadecimal digits.
         """
-        return record | self.parts_of(line_hash)
-
-    def parts_of(self, line_hash: bytes) -> JsonObject:
-        """Return the parts of a line of the journal by its hash; empty if the files lack them."""
         for index, path in enumerate(self._paths):
             if line_hash not in self._entries[index]:
                 self._read_if_changed(index, path)
-            parts = _decode(self._entries[index].get(line_hash, b""))
+            parts = decode_line(self._entries[index].get(line_hash, b""))
             if parts is not None:
                 del parts["line"], parts["step"]
                 return parts
@@ -159,7 +159,7 @@ class RecentPartsFile(RecentParts):
         """
         block = step // BLOCK_STEPS
         path = self._paths[block % len(self._paths)]
-        entry = _encode({**parts, "line": line_hash.decode("ascii"), "step": step})
+        entry = encode_line({**parts, "line": line_hash.decode("ascii"), "step": step})
         if block != self._block:
             self._size = 0 if self._block is not None else _size_to_keep(path, step, line_hash)
             with path.open("ab") as file:

@@ -162,43 +162,30 @@ class _BackwardScan:
         """
         is_header = line.begin == 0
         step = -1 if is_header else int(line.record["step"])
-        self._check_order(line, step)
+        # The step of a line is that of the following line or the one before it.
+        later_step = self._later_step
+        if later_step is not None and later_step - step not in (0, 1):
+            begin = self._later_begin if step < later_step else line.begin
+            raise damaged_line_error(self._path, begin, f"step {later_step} is out of place")
         settled_step = -1 if self.settled is None else self.settled.step
         if is_header or step <= settled_step:
             return False
+        record = line.record
         if self._later_step is None:
-            self.last_record = line.record
+            self.last_record = record
         self._later_step = step
         self._later_begin = line.begin
-        self._keep_settled_state(line.record)
+
+        # The last settled state before all required steps. These include the first step of each
+        # model that was adopted later.
+        if self.settled is None and "settled" in record:
+            settled_step = int(record["settled"]["step"])
+            if all(settled_step < required_step for required_step in self._required_steps):
+                self.settled = SettledState(settled_step, decode_state(record["settled"]["state"]))
+
+        # An adopted model and a late observation revise all decisions from their step on.
         if step < self._first_revised_step:
-            self._next_controls.setdefault(step, line.record["next_control"])
-        self._keep_reading(line.record, step)
-        return True
-
-    def _check_order(self, line: JournalLine, step: int) -> None:
-        """Refuse a line unless its step is that of the following line or the one before it."""
-        later_step = self._later_step
-        if later_step is None or later_step - step in (0, 1):
-            return
-        begin = self._later_begin if step < later_step else line.begin
-        raise damaged_line_error(self._path, begin, f"step {later_step} is out of place")
-
-    def _keep_settled_state(self, record: JsonObject) -> None:
-        """Keep the settled state of a record if it is early enough and none is kept yet."""
-        if self.settled is not None or "settled" not in record:
-            return
-        step = int(record["settled"]["step"])
-        state = record["settled"]["state"]
-        # The required steps include the first step of each model that was adopted later.
-        if all(step < required_step for required_step in self._required_steps):
-            self.settled = SettledState(step, decode_state(state))
-
-    def _keep_reading(self, record: JsonObject, step: int) -> None:
-        """Keep the reading of a record, and the first step whose decisions the record revises.
-
-        An adopted model and a late observation revise all decisions from their step on.
-        """
+            self._next_controls.setdefault(step, record["next_control"])
         if "model" in record:
             from_step = int(record["model"]["from_step"])
             self._first_revised_step = min(self._first_revised_step, from_step)
@@ -207,6 +194,7 @@ class _BackwardScan:
             observed_step = int(record.get("observation_step", step))
             self._first_revised_step = min(self._first_revised_step, observed_step)
             self.readings.setdefault(observed_step, reading_from_line(record, self._noise_free))
+        return True
 
     def check_decisions(self, history: History) -> None:
         """Refuse a history if a decision differs from that in the journal."""

@@ -16,14 +16,18 @@ from twin_master.mission.replay import BelievedModel, spans_of_models
 from twin_master.mission.steps import History
 from twin_master.network.inference import known_control
 
+Spans = Sequence[tuple[Knowledge, slice]]
+"""The models that a twin believed, each with the slice of its steps; see `spans_of_models`."""
+
 
 def expected_in_steps(
-    history: History, knowledge: Knowledge, belief: Float, *, is_smoothed: bool
+    history: History, spans: Spans, belief: Float, *, is_smoothed: bool
 ) -> Expectation:
     """Return the expected observations and rewards in the steps of a history, given a belief.
 
-    The sensor model is averaged over the draws of the calibrated parameter or, if the twin has
-    learnt during the flight, over what it had learnt in each step (`carried`).
+    The model is the one that was believed in the step. The sensor model is averaged over the draws
+    of the calibrated parameter or, if the twin has learnt during the flight, over what it had
+    learnt in each step (`carried`).
 
     Parameters
     ----------
@@ -32,20 +36,27 @@ def expected_in_steps(
     is_smoothed : bool
         Whether the belief is the smoothed one.
     """
-    learnt_expectation = knowledge.expectation
-    if learnt_expectation is None:
-        joint = known_control(belief, history.control_index, len(knowledge.model.controls))
-        return expectation_of_draws(
-            knowledge.sensor_model, knowledge.rewards, joint, history.observation_rows
-        )
-    carried = [step.twin_step.carried for step in history.steps]
-    if is_smoothed:
-        return learnt_expectation.smoothed(carried, belief, history.observed)
-    return learnt_expectation.filtered(carried, belief, history.observed)
+    expectations = []
+    for knowledge, span in spans:
+        part = replace(history, steps=history.steps[span])
+        learnt_expectation = knowledge.expectation
+        if not part.steps:
+            continue
+        if learnt_expectation is None:
+            joint = known_control(belief[span], part.control_index, len(knowledge.model.controls))
+            expectation = expectation_of_draws(
+                knowledge.sensor_model, knowledge.rewards, joint, part.observation_rows
+            )
+        else:
+            expect = learnt_expectation.smoothed if is_smoothed else learnt_expectation.filtered
+            carried = [step.twin_step.carried for step in part.steps]
+            expectation = expect(carried, belief[span], part.observed)
+        expectations.append(expectation)
+    return concatenate_expectations(expectations)
 
 
 def expected_ahead(
-    history: History, knowledge: Knowledge, predicted_beliefs: Float
+    history: History, spans: Spans, predicted_beliefs: Float
 ) -> tuple[Expectation, Float]:
     """Return the predicted observations and rewards in the H steps after each step of a history.
 
@@ -65,20 +76,27 @@ def expected_ahead(
     (T, H, U) array
         The probability of each control.
     """
-    # (T, S, U), with the safest control by the probability that no state explains the sensors
-    policy = knowledge.policy_with_safest_control(history.unexplained)
-    state_and_control = predicted_beliefs[..., None] * policy[:, None]  # (T, H, S, U)
-    control_probability = state_and_control.sum(axis=-2)
-    learnt_expectation = knowledge.expectation
-    if learnt_expectation is None:
-        expectation = expectation_of_draws(
-            knowledge.sensor_model, knowledge.rewards, state_and_control, None
-        )
-        return expectation, control_probability
-    carried = [step.twin_step.carried for step in history.steps]
-    horizon = predicted_beliefs.shape[1]
-    expectation = learnt_expectation.predicted(carried, history.filtered, policy, horizon)
-    return expectation, control_probability
+    expectations = []
+    control_probabilities = []
+    for knowledge, span in spans:
+        part = replace(history, steps=history.steps[span])
+        if not part.steps:
+            continue
+        # (T, S, U), with the safest control by the probability that no state explains the sensors
+        policy = knowledge.policy_with_safest_control(part.unexplained)
+        state_and_control = predicted_beliefs[span][..., None] * policy[:, None]  # (T, H, S, U)
+        control_probabilities.append(state_and_control.sum(axis=-2))
+        learnt_expectation = knowledge.expectation
+        if learnt_expectation is None:
+            expectation = expectation_of_draws(
+                knowledge.sensor_model, knowledge.rewards, state_and_control, None
+            )
+        else:
+            carried = [step.twin_step.carried for step in part.steps]
+            horizon = predicted_beliefs.shape[1]
+            expectation = learnt_expectation.predicted(carried, part.filtered, policy, horizon)
+        expectations.append(expectation)
+    return concatenate_expectations(expectations), np.concatenate(control_probabilities)
 
 
 def residual_summary(
@@ -99,14 +117,8 @@ def residual_summary(
     history = history.without_first(from_step - history.first_step)
     if not history.steps or np.isnan(history.observed).all():
         return {"rms_residual": None, "log_evidence": None}
-    expectations = []
-    for knowledge, span in spans_of_models(history, models):
-        span_history = replace(history, steps=history.steps[span])
-        if span_history.steps:
-            expectations.append(
-                expected_in_steps(span_history, knowledge, span_history.filtered, is_smoothed=False)
-            )
-    expectation = concatenate_expectations(expectations)
+    spans = spans_of_models(history, models)
+    expectation = expected_in_steps(history, spans, history.filtered, is_smoothed=False)
     residual = (history.observed - expectation.mean) / expectation.noise_standard_deviation
     return {
         "rms_residual": float(np.sqrt(np.nanmean(residual**2))),

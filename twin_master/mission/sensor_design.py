@@ -381,7 +381,11 @@ def add_candidate_gauges(scenario: Scenario, candidates: str, folder: Path) -> S
     mesh_file = structure_file.parent / design.mesh  # it is read where it is, and not copied
     mesh = read_mesh(mesh_file, design.unit, design.length_unit)
     gauges = _candidate_gauges(candidates, mesh)
-    _append_gauges(extended_file, gauges)
+    with extended_file.open("a", encoding="utf-8") as text:
+        for gauge in gauges:
+            text.write("\n[[gauge]]\n")
+            for key, value in gauge.model_dump().items():
+                text.write(f"{key} = {json.dumps(value)}\n")
     try:
         content = read_toml(extended_file, InvalidDesignError)
     except InvalidDesignError as error:
@@ -424,15 +428,6 @@ def _extensible_structure(scenario: Scenario) -> tuple[StructureBelief, MeshDesi
         if isinstance(design, MeshDesign):
             return belief, design
     raise MissionInputError("--candidates needs a structure from a mesh as what is believed.")
-
-
-def _append_gauges(structure_file: Path, gauges: Sequence[Gauge]) -> None:
-    """Append a table [[gauge]] for each gauge to a structure file."""
-    with structure_file.open("a", encoding="utf-8") as text:
-        for gauge in gauges:
-            text.write("\n[[gauge]]\n")
-            for key, value in gauge.model_dump().items():
-                text.write(f"{key} = {json.dumps(value)}\n")
 
 
 def _with_all_gauges(

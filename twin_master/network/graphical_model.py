@@ -461,28 +461,23 @@ def factor_tables(
     dict of str to dict of str to (levels, levels) array
         p(next level | level), by the name of the control, then that of the state factor.
     """
-    tables = {control: _stated_tables(scenario, control) for control in scenario.control_names}
-    if leaving_multiplier != 1.0:
-        for control_tables in tables.values():
-            for name, table in control_tables.items():
-                control_tables[name] = leaving_table(table, leaving_multiplier)
+    transition = scenario.transition
+    tables: dict[str, dict[str, Float]] = {}
+    for control in scenario.control_names:
+        tables[control] = {}
+        for factor in scenario.state:
+            if transition.kind == "independent_tables":
+                table = np.asarray(transition.tables[control][factor.name], np.float64)
+            else:
+                probability = probability_of(transition.probability, control, factor.name)
+                table = worsening_table(len(factor.levels), probability)
+            if leaving_multiplier != 1.0:
+                table = leaving_table(table, leaving_multiplier)
+            tables[control][factor.name] = table
     for action in scenario.action:
         action_tables = tables[action.name]
         for name in action.repairs:
             action_tables[name] = repaired_table(action_tables[name], action.success)
-    return tables
-
-
-def _stated_tables(scenario: Scenario, control: str) -> dict[str, Float]:
-    """Return the table of each state factor under a control, as stated, without any repair."""
-    transition = scenario.transition
-    if transition.kind == "independent_tables":
-        stated_tables = transition.tables[control]
-        return {name: np.asarray(stated_tables[name], np.float64) for name in scenario.state_names}
-    tables = {}
-    for factor in scenario.state:
-        probability = probability_of(transition.probability, control, factor.name)
-        tables[factor.name] = worsening_table(len(factor.levels), probability)
     return tables
 
 

@@ -309,28 +309,19 @@ def predict(
     if horizon > 0:
         predicted_beliefs[0] = model.transition.forward(control_index, belief)
     if model.transition.is_product:
-        _predict_by_blocks(model.transition, policy, predicted_beliefs)
+        # By blocks of the transition: the table (U, S, S) of all transitions may be too large.
+        for h in range(1, horizon):
+            joint = predicted_beliefs[h - 1][:, None] * policy
+            next_by_control = [
+                model.transition.forward(u, belief_with_control)
+                for u, belief_with_control in enumerate(joint.T)
+            ]
+            predicted_beliefs[h] = np.sum(next_by_control, axis=0)
     else:
         closed_loop = np.einsum("su,usn->sn", policy, model.transition.matrix)
         for h in range(1, horizon):
             predicted_beliefs[h] = predicted_beliefs[h - 1] @ closed_loop
     return Predicted(predicted_beliefs, predicted_beliefs[:, :, None] * policy)
-
-
-def _predict_by_blocks(
-    transition: TransitionModel, policy: Float, predicted_beliefs: Float
-) -> None:
-    """Fill the later rows of the beliefs (H, S) by applying the blocks of the transition.
-
-    The table (U, S, S) of all transitions is not built, because it may be too large.
-    """
-    for h in range(1, len(predicted_beliefs)):
-        joint = predicted_beliefs[h - 1][:, None] * policy
-        next_by_control = [
-            transition.forward(u, belief_with_control)
-            for u, belief_with_control in enumerate(joint.T)
-        ]
-        predicted_beliefs[h] = np.sum(next_by_control, axis=0)
 
 
 def known_control(belief: ArrayLike, control_index: ArrayLike, control_count: int) -> Float:

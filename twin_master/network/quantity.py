@@ -262,27 +262,6 @@ def _error_moments(
     return -cost, cost_variance
 
 
-def _error_rewards(observation: Float, value: Float, scale: Float) -> Float:
-    """Return the error reward (...) for known sensor values.
-
-    It equals the mean that `_error_moments` returns for a variance of zero, and is faster.
-
-    Parameters
-    ----------
-    observation : (G,) array
-        The observed values, SI; NaN for a lost sensor, which is left out.
-    value : (..., G) array
-        The sensor values without noise.
-    scale : (..., G) or (..., 1) array
-        The absolute error of a sensor for which the reward is -1.
-    """
-    is_present = ~np.isnan(observation)
-    distance = np.abs(observation - value)[..., is_present]
-    scale_of_present = np.broadcast_to(scale, value.shape)[..., is_present]
-    cost_per_distance = 1.0 / (scale_of_present * is_present.sum())
-    return np.asarray(-(distance * cost_per_distance).sum(axis=-1))
-
-
 def _mixture_moments(weight: Float, mean: Float, variance: Float) -> tuple[Float, Float]:
     """Return mean and variance (B, R) of R quantities under B mixtures.
 
@@ -420,7 +399,13 @@ class RewardModel:
         """Return mean and variance of the error reward of an observation (G,), given a belief."""
         state, control = np.nonzero(belief)  # pairs of positive probability
         value = self.quantity.value_per_draw[:, state, control]  # (E, n, G) of n pairs
-        error = _error_rewards(observation, value, self._error_scale[control])
+        # The error reward at each known value. It equals the mean that `_error_moments` returns for
+        # a variance of zero, and is faster.
+        is_present = ~np.isnan(observation)
+        distance = np.abs(observation - value)[..., is_present]
+        scale = np.broadcast_to(self._error_scale[control], value.shape)[..., is_present]
+        cost_per_distance = 1.0 / (scale * is_present.sum())
+        error = -(distance * cost_per_distance).sum(axis=-1)
         weight = self.quantity.draw_weight[:, None] * belief[state, control]
         mean = (weight * error).sum()
         variance = (weight * (error - mean) ** 2).sum()

@@ -11,6 +11,7 @@ checked here.
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, reduce
+from itertools import chain
 from math import prod
 
 import numpy as np
@@ -297,7 +298,10 @@ class TransitionModel:
         }
         have_same_shapes = len(distinct_shapes) == 1
         have_factors = all(len(shapes) > 0 for shapes in distinct_shapes)
-        are_square = all(_is_square(shape) for shapes in distinct_shapes for shape in shapes)
+        are_square = all(
+            len(shape) == 2 and shape[0] == shape[1]
+            for shape in chain.from_iterable(distinct_shapes)
+        )
         if not (have_same_shapes and have_factors and are_square):
             raise InvalidModelError(
                 "every control needs one square table for each factor, of the same size under all "
@@ -387,11 +391,6 @@ class TransitionModel:
         if not self.is_product:
             return np.asarray(self.blocks[0][control] @ value)
         return _apply_along_axes([block[control] for block in self.blocks], value)
-
-
-def _is_square(shape: tuple[int, ...]) -> bool:
-    """Return whether a shape is that of a square matrix."""
-    return len(shape) == 2 and shape[0] == shape[1]
 
 
 def _apply_along_axes(matrices: Sequence[Float], vectors: Float) -> Float:

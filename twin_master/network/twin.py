@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import re
 from collections import deque
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal, get_args
 
@@ -416,8 +416,14 @@ class Twin:
                 raise unbelievable_observation(self.name, step)
             proposals_before = proposals
             if self.decision_rule.hold is not None:
-                proposals = self._proposals_after(estimate, proposals_before)
-            new_steps.append(_KeptStep(observation, previous_carried, proposals))
+                in_force = np.array([control_index])
+                probability = self.decision_rule.probabilities(
+                    estimate.filtered[None], in_force, np.array([estimate.unexplained])
+                )
+                _, _, (proposals,) = self.decision_rule.decide(
+                    probability, in_force, np.array([proposals_before])
+                )
+            new_steps.append(_KeptStep(observation, previous_carried, int(proposals)))
             notices += estimate.notices
         # From here on nothing fails, so that a refused observation leaves the twin unchanged.
         for _ in range(len(self._kept_steps) - kept_count_before):
@@ -504,7 +510,20 @@ class Twin:
             steps, proposed = arrays["steps"].tolist()
             kept_steps: list[_KeptStep] = []
             while f"{len(kept_steps)}/control" in arrays:
-                kept_steps.append(_kept_step_from_arrays(arrays, len(kept_steps)))
+                index = len(kept_steps)
+                prefix = f"{index}/carried/"
+                carried_arrays = {
+                    name.removeprefix(prefix): value
+                    for name, value in arrays.items()
+                    if name.startswith(prefix)
+                }
+                kept_steps.append(
+                    _KeptStep(
+                        arrays[f"{index}/observation"],
+                        Carried(int(arrays[f"{index}/control"]), carried_arrays),
+                        int(arrays.get(f"{index}/proposals", 0)),
+                    )
+                )
         self._steps = steps
         self._proposed = proposed
         self._kept_steps.clear()
@@ -525,16 +544,6 @@ class Twin:
                 )
             return controls.index(control)
         return int(checked_controls(control, len(controls)))
-
-    def _proposals_after(self, estimate: Estimate, proposals_before: int) -> int:
-        """Return how often in a row a harder control has been proposed, counting this step."""
-        control = np.array([estimate.carried.control_index])
-        probability = self.decision_rule.probabilities(
-            estimate.filtered[None], control, np.array([estimate.unexplained])
-        )
-        before = np.array([proposals_before])
-        _, _, (proposals,) = self.decision_rule.decide(probability, control, before)
-        return int(proposals)
 
     def _decide(self, estimate: Estimate, proposals_before: int) -> TwinStep:
         """Predict from the estimate of the last step, and decide on the next control.
@@ -602,20 +611,4 @@ def unbelievable_observation(twin: str, step: int) -> InvalidObservationError:
     return InvalidObservationError(
         f"twin {twin!r}, step {step}: the observation is so improbable after the earlier ones that "
         "no belief can be computed; check the sensors and the control in force"
-    )
-
-
-def _kept_step_from_arrays(arrays: Mapping[str, AnyArray], index: int) -> _KeptStep:
-    """Return the kept step with a given index from the arrays of a saved state."""
-    prefix = f"{index}/carried/"
-    carried_arrays = {
-        name.removeprefix(prefix): value
-        for name, value in arrays.items()
-        if name.startswith(prefix)
-    }
-    control_index = int(arrays[f"{index}/control"])
-    return _KeptStep(
-        arrays[f"{index}/observation"],
-        Carried(control_index, carried_arrays),
-        int(arrays.get(f"{index}/proposals", 0)),
     )

@@ -99,7 +99,8 @@ class Section(toml_file.Section):
             field, unit = cls.split_unit(str(key))
             if field not in cls.model_fields:
                 known_keys = ", ".join(cls._documented_key(name) for name in cls.model_fields)
-                nearest_key = nearest_word(str(key), cls._keys_in_file())
+                keys_with_units = [f"{name}_{unit}" for name, unit in cls.units.items()]
+                nearest_key = nearest_word(str(key), [*cls.model_fields, *keys_with_units])
                 advice = "" if nearest_key is None else f"; the nearest is `{nearest_key}`"
                 raise ValueError(
                     f"unknown key `{key}`; the keys known there are {known_keys}{advice}"
@@ -132,11 +133,6 @@ class Section(toml_file.Section):
     def _documented_key(cls, name: str) -> str:
         """Return a key for a message, with the unit that it may carry: `levels[_percent]`."""
         return f"{name}[_{cls.units[name]}]" if name in cls.units else name
-
-    @classmethod
-    def _keys_in_file(cls) -> list[str]:
-        """Return the keys that a file may have, with and without their units."""
-        return [*cls.model_fields, *(f"{name}_{unit}" for name, unit in cls.units.items())]
 
     @classmethod
     def split_unit(cls, key: str) -> tuple[str, str]:

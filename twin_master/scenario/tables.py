@@ -101,23 +101,18 @@ class Transition(Section):
         """
         if self.kind == "independent_worsening":
             yield self.tables, "`transition.tables` belongs to the kind `independent_tables`"
-            yield from self._probability_checks(controls, tuple(level_counts))
+            key = "transition.probability"
+            yield incomplete_table_check(self.probability, controls, key, "control")
+            for control, probability in self.probability.items():
+                if isinstance(probability, dict):
+                    states = tuple(level_counts)
+                    yield incomplete_table_check(probability, states, f"{key}.{control}", "state")
         else:
             yield (
                 self.probability,
                 "`transition.probability` belongs to the kind `independent_worsening`",
             )
             yield from self._table_checks(controls, level_counts)
-
-    def _probability_checks(
-        self, controls: tuple[str, ...], states: tuple[str, ...]
-    ) -> Iterator[Check]:
-        """Yield (has failed, message) for each rule on names of probabilities."""
-        key = "transition.probability"
-        yield incomplete_table_check(self.probability, controls, key, "control")
-        for control, probability in self.probability.items():
-            if isinstance(probability, dict):
-                yield incomplete_table_check(probability, states, f"{key}.{control}", "state")
 
     def _table_checks(
         self, controls: tuple[str, ...], level_counts: Mapping[str, int]

@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 from reporting.arrays import AnyArray, Float
 from reporting.formats.netcdf import NetcdfGroup, Variable
 from reporting.formats.table_file import table_text
-from twin_master.learning.expectation import Expectation, concatenate_expectations
+from twin_master.learning.expectation import Expectation
 from twin_master.mission.plant import SensorStatus, Truth
 from twin_master.mission.residuals import expected_ahead, expected_in_steps
 from twin_master.network.planner import BeliefPolicy
@@ -40,7 +40,7 @@ def run_groups(result: MissionResult) -> dict[str, NetcdfGroup]:
     scenario = result.scenario
     flight = result.flight
     plan = result.knowledge.plan
-    smoothed = _expected_in_flight(result, flight.smoothed, is_smoothed=True)
+    smoothed = expected_in_steps(flight, result.spans, flight.smoothed, is_smoothed=True)
     entries: dict[str, Iterable[Entry]] = {
         "observed": _observed_entries(result),
         "filtered": _plain_entries(_filtered_variables(result)),
@@ -116,7 +116,7 @@ def _observed_entries(result: MissionResult) -> Iterator[Entry]:
 def _filtered_variables(result: MissionResult) -> dict[str, ArrayLike]:
     """Return the filtered belief with decisions, evidence and residuals."""
     flight = result.flight
-    expectation = _expected_in_flight(result, flight.filtered, is_smoothed=False)
+    expectation = expected_in_steps(flight, result.spans, flight.filtered, is_smoothed=False)
     residual = flight.observed - expectation.mean
     return {
         **_belief_variables(result, flight.filtered, expectation),
@@ -129,45 +129,12 @@ def _filtered_variables(result: MissionResult) -> dict[str, ArrayLike]:
 
 
 def _predicted_variables(result: MissionResult) -> dict[str, ArrayLike]:
-    """Return the variables of the group `predicted`, whose leading axes are step and horizon.
-
-    A twin that adopts a patched model has different knowledge in different spans of its steps: the
-    expectations are computed for each span and concatenated.
-    """
-    flight = result.flight
-    predicted_belief = flight.predicted
-    expected_parts = []
-    control_probabilities = []
-    for knowledge, span in result.spans:
-        history_of_span = replace(flight, steps=flight.steps[span])
-        expected_in_span, control_probability = expected_ahead(
-            history_of_span, knowledge, predicted_belief[span]
-        )
-        expected_parts.append(expected_in_span)
-        control_probabilities.append(control_probability)
-    values = _belief_variables(result, predicted_belief, concatenate_expectations(expected_parts))
-    values["control_probability"] = np.concatenate(control_probabilities)
+    """Return the variables of the group `predicted`, whose leading axes are step and horizon."""
+    belief = result.flight.predicted
+    expectation, control_probability = expected_ahead(result.flight, result.spans, belief)
+    values = _belief_variables(result, belief, expectation)
+    values["control_probability"] = control_probability
     return values
-
-
-def _expected_in_flight(result: MissionResult, belief: Float, *, is_smoothed: bool) -> Expectation:
-    """Return the expected sensor values and rewards of each step, by the model believed then.
-
-    Parameters
-    ----------
-    belief : (T, states) array
-        The belief over states in each step.
-    is_smoothed : bool
-        Whether the belief is smoothed, and not filtered.
-    """
-    flight = result.flight
-    expected_parts = []
-    for knowledge, span in result.spans:
-        history_of_span = replace(flight, steps=flight.steps[span])
-        expected_parts.append(
-            expected_in_steps(history_of_span, knowledge, belief[span], is_smoothed=is_smoothed)
-        )
-    return concatenate_expectations(expected_parts)
 
 
 def _belief_variables(

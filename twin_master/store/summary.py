@@ -12,7 +12,7 @@ from reporting.json_file import JsonObject
 from reporting.words import counted, parameter_title
 from twin_master.mission.earnings import return_reference
 from twin_master.network.estimator import is_state_believed
-from twin_master.network.graphical_model import GraphicalModel, StateSpace
+from twin_master.network.graphical_model import StateSpace
 from twin_master.scenario.schema import REWARD_NAMES, SUMMARY_TITLES, Scenario
 from twin_master.scenario.section import printed_state
 from twin_master.store.mission_result import (
@@ -224,15 +224,6 @@ def find_policy_switch(
     return None
 
 
-def filtered_rms_error(model: GraphicalModel, filtered_belief: Float, true_state: Float) -> Float:
-    """Return the root mean square, over the steps, of the error of each filtered state factor.
-
-    The error is the filtered mean minus the true value, SI.
-    """
-    error = model.states.mean(filtered_belief) - true_state
-    return np.asarray(np.sqrt(np.mean(error**2, axis=0)))
-
-
 def summarise(
     result: MissionResult,
     reward_mean: Float,
@@ -253,16 +244,16 @@ def summarise(
     """
     groups = [*first_groups]
     groups += _truth_groups(result) if result.flight.simulated else _watched_groups(result)
-    groups += _reward_groups(reward_mean, result.scenario.mission.step_name)
-    if result.flight.simulated:
-        groups.append(_earned_group(result))
+    groups += _reward_groups(result, reward_mean)
     groups += _parameter_groups(result)
     groups.append(SummaryGroup("evidence", {}, [float(result.flight.log_evidence.sum())]))
     groups += _learnt_groups(result)
     groups += _observation_groups(result)
     if misfit is not None:
         groups += _misfit_groups(misfit)
-    groups += _error_bound_groups(result)
+    error_bounds = result.flight.monitors.get("strain_error_bound")  # certified, of the asset
+    if error_bounds is not None and {*result.scenario.observation.sensor_units} == {"1"}:
+        groups.append(SummaryGroup("bound", {}, [1e6 * float(error_bounds.max())]))
     groups += _suspicion_groups(result)
     references = {reference.figure: reference for reference in result.scenario.reference}
     if result.flight.simulated:
@@ -281,26 +272,24 @@ def summarise(
                 yield SummaryEntry(key, title, value, unit, reference.value, reference.source)
 
 
-def _reward_groups(reward_mean: Float, step_name: str) -> Iterator[SummaryGroup]:
-    """Yield the mean of each reward over the steps, without those in which it is NaN.
+def _reward_groups(result: MissionResult, reward_mean: Float) -> Iterator[SummaryGroup]:
+    """Yield the mean of each reward over the steps, and what a simulated mission has earned.
 
-    The mean is None if the reward is NaN in all steps.
+    The mean leaves out steps in which the reward is NaN; it is None if these are all. The earnings
+    are the discounted return, and the percentages of steps beyond the limit and of needless ones.
     """
+    step_name = result.scenario.mission.step_name
     for name, rewards in zip(REWARD_NAMES, reward_mean.T, strict=True):
         finite = rewards[np.isfinite(rewards)]
         mean = float(finite.mean()) if len(finite) else None
         yield SummaryGroup("reward", {"reward": name, "step": step_name}, [mean])
-
-
-def _earned_group(result: MissionResult) -> SummaryGroup:
-    """Return the discounted return, and the percentages of steps beyond the limit and needless."""
-    earned = result.earned
-    values = [
-        result.discounted_return,
-        100.0 * float(np.mean(earned.beyond_limit)),
-        100.0 * float(np.mean(earned.needless)),
-    ]
-    return SummaryGroup("earned", {"step": result.scenario.mission.step_name}, values)
+    if result.flight.simulated:
+        values = [
+            result.discounted_return,
+            100.0 * float(np.mean(result.earned.beyond_limit)),
+            100.0 * float(np.mean(result.earned.needless)),
+        ]
+        yield SummaryGroup("earned", {"step": step_name}, values)
 
 
 def _observation_groups(result: MissionResult) -> Iterator[SummaryGroup]:
@@ -335,13 +324,6 @@ def _misfit_groups(misfit: Float) -> Iterator[SummaryGroup]:
     rms = float(np.sqrt(np.mean(misfit[is_known] ** 2)))
     percent = [100.0 * rms, 100.0 * float(largest_of_sensor[sensor])]
     yield SummaryGroup("misfit", {"sensor": sensor + 1}, percent)
-
-
-def _error_bound_groups(result: MissionResult) -> Iterator[SummaryGroup]:
-    """Yield the largest certified strain error, if the asset reports it."""
-    error_bounds = result.flight.monitors.get("strain_error_bound")
-    if error_bounds is not None and {*result.scenario.observation.sensor_units} == {"1"}:
-        yield SummaryGroup("bound", {}, [1e6 * float(error_bounds.max())])
 
 
 def _suspicion_groups(result: MissionResult) -> Iterator[SummaryGroup]:
@@ -460,8 +442,9 @@ def _truth_groups(result: MissionResult) -> Iterator[SummaryGroup]:
         flight.state,
     )
     yield fallback_group(fallback, scenario)
-    errors = filtered_rms_error(knowledge.model, flight.filtered, flight.state)
-    for factor, error in zip(scenario.state, errors.tolist(), strict=True):
+    error_of_mean = knowledge.model.states.mean(flight.filtered) - flight.state  # (T, F)
+    rms_error = np.sqrt(np.mean(error_of_mean**2, axis=0))
+    for factor, error in zip(scenario.state, rms_error.tolist(), strict=True):
         scale, unit = printed_state(factor.unit, "percentage points")
         fields = {"state": factor.name, "title": factor.title or factor.name, "unit": unit}
         yield SummaryGroup("error", fields, [scale * error])
