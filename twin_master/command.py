@@ -1,6 +1,5 @@
 """Commands of one mission: `run`, also as `python -m twin_master`, and `view`."""
 
-import json
 import traceback
 import webbrowser
 from collections.abc import Callable
@@ -14,6 +13,7 @@ from reporting import terminal
 from reporting.errors import InvalidChoiceError, ReportingError
 from reporting.files import NO_SPACE
 from reporting.formats.former_options import former_names_as_lines
+from reporting.json_file import read_json
 from reporting.terminal import JsonOption, NoReportOption
 from reporting.words import number
 from twin_master.command_options import (
@@ -301,7 +301,13 @@ def _fly_and_print_mission(
     with view_beside(view) as begun, terminal.interruptible(explain_interruption):
         outcome = fly_mission(progress=terminal.progress(), report=report, begun=begun)
         if json:
-            terminal.print_json(_outcome_record(outcome))
+            from twin_master.store.writing import SUMMARY_NAME
+
+            # The summary, with the paths of run and report.
+            report_path = None if outcome.report is None else str(outcome.report)
+            record: JsonObject = {"folder": str(outcome.folder), "report": report_path}
+            record |= read_json(outcome.folder / SUMMARY_NAME, ReportingError)
+            terminal.print_json(record)
         else:
             print_outcome(outcome)
 
@@ -325,17 +331,6 @@ def _scenario_and_ssp(
     return scenario, None
 
 
-def _outcome_record(outcome: "RunOutcome") -> "JsonObject":
-    """Return the content of `summary.json` with the paths of run and report."""
-    from twin_master.store.writing import SUMMARY_NAME
-
-    summary = (outcome.folder / SUMMARY_NAME).read_text(encoding="utf-8")
-    report = None if outcome.report is None else str(outcome.report)
-    record: JsonObject = {"folder": str(outcome.folder), "report": report}
-    record |= json.loads(summary)
-    return record
-
-
 def print_outcome(outcome: "RunOutcome") -> None:
     """Print what the twin did, the figures of a run beside their references, and its files."""
     from twin_master.store.writing import printed_values
@@ -348,14 +343,17 @@ def print_outcome(outcome: "RunOutcome") -> None:
         )
     for notice in outcome.notices:
         terminal.say(notice.replace(" DIR", f" {outcome.folder}"), fg="yellow")
-    numbers_of_sources = _numbers_of_sources(outcome)
+    numbers_of_sources: dict[str, int] = {}  # of the references, from 1
     rows = []
     texts = printed_values(outcome.figures)
     for figure, (value, reference) in zip(outcome.figures, texts, strict=True):
         if reference and not isinstance(figure.reference, str):  # a text has its unit in it
             reference = f"{reference} {figure.unit}".strip()
         if figure.reference_source:
-            reference += f" ({numbers_of_sources[figure.reference_source]})"
+            source_number = numbers_of_sources.setdefault(
+                figure.reference_source, len(numbers_of_sources) + 1
+            )
+            reference += f" ({source_number})"
         value = "none" if figure.value is None else f"{value} {figure.unit}".strip()
         rows.append([figure.title, value, reference])
     terminal.print_table(["result", "this run", "reference"], rows + _timing_rows(outcome))
@@ -365,15 +363,6 @@ def print_outcome(outcome: "RunOutcome") -> None:
         terminal.say(f"Report: {outcome.report}")
     else:
         terminal.say(f"Run: {outcome.folder}")
-
-
-def _numbers_of_sources(outcome: "RunOutcome") -> dict[str, int]:
-    """Return the number, from 1, of each source of a reference."""
-    numbers: dict[str, int] = {}
-    for figure in outcome.figures:
-        if figure.reference_source and figure.reference_source not in numbers:
-            numbers[figure.reference_source] = len(numbers) + 1
-    return numbers
 
 
 def _timing_rows(outcome: "RunOutcome") -> list[list[str]]:

@@ -109,7 +109,13 @@ def parse_broker(
         )
     tls = parts.scheme == "mqtts"
     if authority is not None:
-        _check_certificate(authority, tls=tls)
+        if not tls:
+            raise MissionInputError(f"the certificate {authority} needs an address with mqtts://.")
+        if not authority.is_file():
+            raise MissionInputError(f"there is no file {authority} with a certificate.")
+        before = f"{authority} holds no certificate: "
+        with MissionInputError.instead_of(OSError, before=before, after="."):
+            create_default_context(cafile=authority)
     return Broker(
         host=parts.hostname,
         port=port or (_PORT_WITH_TLS if tls else _PORT),
@@ -125,15 +131,3 @@ def _address_error(address: str) -> MissionInputError:
     return MissionInputError(
         f"{address}: `mqtt://[USER@]HOST[:PORT]/TOPIC` is expected, or `mqtts://`."
     )
-
-
-def _check_certificate(authority: Path, *, tls: bool) -> None:
-    """Raise an error if a certificate is no readable file, or is given without `mqtts://`."""
-    if not tls:
-        raise MissionInputError(f"the certificate {authority} needs an address with mqtts://.")
-    if not authority.is_file():
-        raise MissionInputError(f"there is no file {authority} with a certificate.")
-    with MissionInputError.instead_of(
-        OSError, before=f"{authority} holds no certificate: ", after="."
-    ):
-        create_default_context(cafile=authority)

@@ -159,10 +159,6 @@ class CsvFeed(RecordedFeed):
                 return None
         if len(cells) != len(self._columns):
             return Refused(f"{len(self._columns)} cells are expected, but {len(cells)} were given")
-        return self._record_of(cells)
-
-    def _record_of(self, cells: Sequence[str]) -> dict[str, object]:
-        """Return the value of each column in a row; columns without a value are left out."""
         record: dict[str, object] = {}
         for name, cell in zip(self._columns, cells, strict=True):
             is_missing = name in OTHER_KEYS and cell.lower() in _MISSING_VALUES

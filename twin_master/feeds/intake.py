@@ -293,7 +293,13 @@ class Intake:
 
     def _receive_message(self, twin: Twin) -> bool:
         """Queue the readings of the next message, or refuse it; return whether there was one."""
-        item = self._next_item()
+        if self._messages is None:
+            self._messages = self._feed.messages(self._position)
+        self._is_waiting = self.on_poll is not None
+        try:
+            item = next(self._messages, None)  # without a message if nothing has come yet
+        finally:
+            self._is_waiting = False
         self.has_ended = item is None
         message, self._text = item or (None, "")
         if message is None:
@@ -316,19 +322,6 @@ class Intake:
             self._refuse(str(refusal), step)
         return True
 
-    def _next_item(self) -> FeedItem | None:
-        """Return the next item of the feed; None if it has ended.
-
-        The item has no message if nothing has come yet.
-        """
-        if self._messages is None:
-            self._messages = self._feed.messages(self._position)
-        self._is_waiting = self.on_poll is not None
-        try:
-            return next(self._messages, None)
-        finally:
-            self._is_waiting = False
-
     def _next_reading(self, twin: Twin) -> Reading:
         """Take the first reading from the queue, record it, and return it.
 
@@ -346,40 +339,27 @@ class Intake:
         if queued.status is StepStatus.MISSING:
             self.notices += self.stream.pop_pending()
         else:
-            self.notices += self._note_accepted(queued.step, reading)
+            # The reading may still be refused later, see `replace_impossible`.
+            is_blind = bool(np.isnan(reading.observed).all())
+            if not is_blind:
+                self._messages_with_readings += 1
+            ignored = reading.ignored if isinstance(reading, Message) else {}
+            if reading.revises is not None:  # a late message does not show how the sensors are now
+                is_blind = self.stream.is_blind
+            self.notices += self.stream.accept(queued.step, is_blind=is_blind, ignored=ignored)
+
         if reading.revises is None:
             self._statuses.append(queued.status)
             if queued.status is StepStatus.MISSING:
                 self.counts.missing += 1
-        else:
-            self._note_revision(queued.step - twin.steps, queued.status)
-        return reading
-
-    def _note_revision(self, index: int, status: StepStatus) -> None:
-        """Count a late message, and update the status of its step.
-
-        `index` is the step of the message minus the next step of the twin, so -1 is the last step.
-        `status` is the status that this message alone gives to its step.
-        """
+            return reading
+        index = queued.step - twin.steps  # -1 is the last step
         self.counts.late += 1
         if self._statuses[index] is StepStatus.MISSING:
             self.counts.missing -= 1
         # A status grows from MISSING over ASSUMED_CONTROL to WITH_CONTROL: nothing known is lost
-        self._statuses[index] = max(status, self._statuses[index])
-
-    def _note_accepted(self, step: int, reading: Reading) -> list[Notice]:
-        """Record that a message is accepted for its step; return the notices about the stream.
-
-        The message is counted if it has any reading. The reading may still be refused later, see
-        `replace_impossible`.
-        """
-        is_blind = bool(np.isnan(reading.observed).all())
-        if not is_blind:
-            self._messages_with_readings += 1
-        ignored = reading.ignored if isinstance(reading, Message) else {}
-        if reading.revises is not None:  # a late message does not show how the sensors are now
-            is_blind = self.stream.is_blind
-        return self.stream.accept(step, is_blind=is_blind, ignored=ignored)
+        self._statuses[index] = max(queued.status, self._statuses[index])
+        return reading
 
     def complaint(self) -> str:
         """Return a sentence that says why the messages of this process were of no use, or "".
@@ -519,17 +499,14 @@ class Intake:
             self._enqueue_revision(twin, message, step, status)
             return
         if steps_ahead > 0:
-            self.stream.note_gap(twin.steps, step, self._likely_unit(twin, message))
+            likely_unit = ""  # of the time of the message
+            if message.step is None and message.time is not None:
+                likely_unit = self._clock.likely_unit(message.time, twin.steps)
+            self.stream.note_gap(twin.steps, step, likely_unit)
         for missing_step in range(twin.steps, step):
             no_reading = Reading(np.full(self._width, np.nan))
             self._queue.append(_QueuedReading(missing_step, no_reading, StepStatus.MISSING))
         self._queue.append(_QueuedReading(step, message, status))
-
-    def _likely_unit(self, twin: Twin, message: Message) -> str:
-        """Return the unit that the time of a message seems to have; see `Clock.likely_unit`."""
-        if message.step is not None or message.time is None:
-            return ""
-        return self._clock.likely_unit(message.time, twin.steps)
 
     def _enqueue_revision(
         self, twin: Twin, message: Message, step: int, status: StepStatus

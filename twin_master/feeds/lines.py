@@ -5,7 +5,7 @@ import os
 import re
 from collections.abc import Iterator
 from contextlib import ExitStack, suppress
-from functools import lru_cache
+from functools import lru_cache, partial
 from glob import escape
 from hashlib import sha256
 from pathlib import Path
@@ -154,21 +154,15 @@ class Lines:
                 if not line:
                     self.begin = self.end
                 self.end += len(part)
-                line = self._extend_line(line, part)
+                if isinstance(line, bytes):
+                    line += part
+                    if len(line) > self.longest:
+                        line = Refused(f"a message has at most {self.longest} bytes")
                 if part.endswith(b"\n"):
                     yield line
                     line = b""
         if isinstance(line, bytes) and line:
             yield line
-
-    def _extend_line(self, line: bytes | Refused, part: bytes) -> bytes | Refused:
-        """Return a line with a further part; a line that gets too long becomes a refusal."""
-        if isinstance(line, Refused):
-            return line
-        longer_line = line + part
-        if len(longer_line) > self.longest:
-            return Refused(f"a message has at most {self.longest} bytes")
-        return longer_line
 
 
 class Pipe(Lines):
@@ -242,20 +236,13 @@ class GrowingFile(Lines):
         """Yield the pieces of the file and, if its name is followed, of files that replace it."""
         try:
             if self._followed_path is None:
-                yield from self._pieces_to_end()
+                for piece in iter(partial(self._file.read, _PIECE_BYTES), b""):
+                    self._note_beginning(piece)
+                    yield piece
             else:
                 yield from self._followed_pieces(self._followed_path)
         finally:
             self._file.close()
-
-    def _pieces_to_end(self) -> Iterator[bytes]:
-        """Yield the pieces of the file up to its end."""
-        while True:
-            piece = self._file.read(_PIECE_BYTES)
-            if not piece:
-                return
-            self._note_beginning(piece)
-            yield piece
 
     def _followed_pieces(self, path: Path) -> Iterator[bytes | Refused | None]:
         """Yield the pieces of the file and of files that get its name later, without end.
@@ -267,7 +254,9 @@ class GrowingFile(Lines):
                 yield from self._switch_after_loss(path)
                 continue
             piece = self._file.read(_PIECE_BYTES)
-            if self._was_cut():
+            # The file may have been truncated after it was read, even if it has grown again.
+            is_same = is_same_beginning(self._file, self._beginning)
+            if not is_same or os.fstat(self._file.fileno()).st_size < self._file.tell():
                 yield from self._switch_after_cut(path)
                 continue
             if not piece:
@@ -365,12 +354,6 @@ class GrowingFile(Lines):
         self._is_copy = is_copy
         if not line_goes_on:
             yield b""
-
-    def _was_cut(self) -> bool:
-        """Return whether the file was truncated after it was read, even if it has grown again."""
-        if not is_same_beginning(self._file, self._beginning):
-            return True
-        return os.fstat(self._file.fileno()).st_size < self._file.tell()
 
     def _open_next(self, path: Path) -> BinaryIO | None:
         """Return the next file under the name `path`, open for reading.

@@ -291,7 +291,10 @@ class MessageReader:
         self._check_ignored_names(readings)
         step = self._read_step(record.get("step"))
         time = self._read_time(record.get("time"))
-        control = self._read_control(record.get("control"))
+        control_name = record.get("control")
+        if control_name is not None and control_name not in self._controls:
+            raise Refused(f"`control` is one of {', '.join(self._controls)}, or absent")
+        control = None if control_name is None else self._controls.index(str(control_name))
         return Message(
             readings.observed,
             control,
@@ -324,7 +327,10 @@ class MessageReader:
             if sensor in readings.sensors:
                 raise Refused(f"sensor {sensor + 1} is given twice")
             readings.sensors.add(sensor)
-            number = self._number_in_si(value, column)
+            number = math.nan
+            if not isinstance(value, bool):
+                with suppress(TypeError, ValueError, OverflowError):
+                    number = float(value) * column.factor  # type: ignore[arg-type]
             if abs(number) <= self._largest_values[sensor]:
                 readings.observed[sensor] = number
             else:
@@ -374,21 +380,14 @@ class MessageReader:
                 time = float(value) / self._units_per_second
         if isinstance(value, str) and math.isnan(time):
             with suppress(ValueError):
-                time = _seconds_of_date(value)
+                date = datetime.fromisoformat(value.strip().removesuffix("UTC").rstrip())
+                time = (date if date.tzinfo else date.replace(tzinfo=UTC)).timestamp()
         if not math.isfinite(time):
             raise Refused(
                 "`time` is a number, or a date and time such as 2026-03-31T10:00:00Z, but "
                 f"{value!r:.40} was given"
             )
         return time
-
-    def _read_control(self, value: object) -> int | None:
-        """Return the index of the control in a message; None without one."""
-        if value is None:
-            return None
-        if value not in self._controls:
-            raise Refused(f"`control` is one of {', '.join(self._controls)}, or absent")
-        return self._controls.index(str(value))
 
     def _named_values(self, record: Mapping[str, object]) -> Iterator[tuple[str, object]]:
         """Yield the name and the value of each sensor in a parsed message.
@@ -436,15 +435,6 @@ class MessageReader:
             raise Refused("`covariance` is not symmetric with eigenvalues of zero or more")
         return matrix[np.tril_indices(count)]
 
-    def _number_in_si(self, value: object, column: SensorColumn) -> float:
-        """Return the value of a sensor in SI units; NaN if it is not a number."""
-        if isinstance(value, bool):
-            return math.nan
-        try:
-            return float(value) * column.factor  # type: ignore[arg-type]
-        except (TypeError, ValueError, OverflowError):
-            return math.nan
-
     def _describe_unreadable(self, value: object, number: float, column: SensorColumn) -> str:
         """Return, in words, the value that is no reading, given also in SI units.
 
@@ -458,14 +448,6 @@ class MessageReader:
         if is_strain and column.factor == 1.0:
             advice = f"; give its unit, such as `strain_{column.sensor + 1}_microstrain`"
         return f"{number:g}{advice}"
-
-
-def _seconds_of_date(text: str) -> float:
-    """Return a date and time by ISO 8601 in seconds since 1970; UTC if it has no offset."""
-    moment = datetime.fromisoformat(text.strip().removesuffix("UTC").rstrip())
-    if moment.tzinfo is None:
-        moment = moment.replace(tzinfo=UTC)
-    return moment.timestamp()
 
 
 @lru_cache(maxsize=1000)

@@ -334,18 +334,15 @@ class StreamNotices:
         self._refused_steps = []
         self._refusals_are_reported = False
         if is_blind and not self.is_blind:
-            notices.append(self._blind_notice(when, ignored))
+            names = listing(f"`{name}`" for name in ignored)
+            passed_over = f"; passed over: {names}" if names else ""
+            sentence = (
+                f"{when}: the message has no reading of any {self._words.sensor}{passed_over}."
+            )
+            notices.append(Notice("blind", sentence))
         self.is_blind = is_blind
         notices += self._report_misspellings(when, ignored)
         return notices
-
-    def _blind_notice(self, when: str, ignored: Mapping[str, str]) -> Notice:
-        """Return the notice that a message has no reading of any sensor."""
-        names = listing(f"`{name}`" for name in ignored)
-        passed_over = f"; passed over: {names}" if names else ""
-        sensor = self._words.sensor
-        sentence = f"{when}: the message has no reading of any {sensor}{passed_over}."
-        return Notice("blind", sentence)
 
     def _report_misspellings(self, when: str, ignored: Mapping[str, str]) -> list[Notice]:
         """Return a notice about ignored names that look like misspelt sensors or keys, if any.

@@ -62,41 +62,26 @@ def check_fleet(fleet: Fleet) -> None:
     """
     faults = []
     for group in fleet.groups:
-        faults += _faults_of_scenarios(group)
-        faults += _faults_of_recordings(group)
+        is_real = bool(group.observations)
+        mean_parameters = {name: spread.mean for name, spread in group.parameter_spreads.items()}
+        for number, scenario in enumerate(group.scenarios):
+            try:
+                _check_scenario(group, scenario)
+                source_of(with_parameters(scenario, mean_parameters), is_real=is_real).check()
+            except FLIGHT_ERRORS as error:
+                has_many = len(group.scenarios) > 1
+                asset = f"{group.name} {group.members[number].name}" if has_many else group.name
+                faults.append(f"{asset}: {error}")
+
+        # The recordings of real assets
+        for member in group.members if is_real else ():
+            try:
+                file_feed(member.file or Path(), group.scenarios[0])
+            except FLIGHT_ERRORS as error:
+                faults.append(f"{group.name}: {error}")
     if faults:
         heading = f"{len(faults)} of the assets cannot fly, so none did:"
         raise FleetError("\n".join([heading, *faults]))
-
-
-def _faults_of_scenarios(group: Group) -> list[str]:
-    """Return a sentence for each scenario of a group that cannot be simulated, with the reason."""
-    faults = []
-    mean_parameters = {name: spread.mean for name, spread in group.parameter_spreads.items()}
-    is_real = bool(group.observations)
-    for number, scenario in enumerate(group.scenarios):
-        try:
-            _check_scenario(group, scenario)
-            source_of(with_parameters(scenario, mean_parameters), is_real=is_real).check()
-        except FLIGHT_ERRORS as error:
-            asset = group.name
-            if len(group.scenarios) > 1:
-                asset += f" {group.members[number].name}"
-            faults.append(f"{asset}: {error}")
-    return faults
-
-
-def _faults_of_recordings(group: Group) -> list[str]:
-    """Return a sentence for each recording of real assets that cannot be read, with the reason."""
-    if not group.observations:
-        return []
-    faults = []
-    for member in group.members:
-        try:
-            file_feed(member.file or Path(), group.scenarios[0])
-        except FLIGHT_ERRORS as error:
-            faults.append(f"{group.name}: {error}")
-    return faults
 
 
 def _check_scenario(group: Group, scenario: Scenario) -> None:

@@ -51,7 +51,6 @@ from twin_master.mission.parts import (
 from twin_master.mission.plant import FLIGHT_ERRORS
 from twin_master.mission.preparation import prepare_knowledge
 from twin_master.network.graphical_model import build_graphical_model
-from twin_master.network.sensor_model import GaussianSensorModel
 from twin_master.pictures import plot_courses
 from twin_master.scenario.schema import Scenario
 
@@ -189,8 +188,7 @@ def fly_fleet(
     ) as config:
         if not (folder / JOURNAL_NAME).is_file():
             create_store(folder, fleet)
-        _note_fixed_transitions(fleet, progress)
-        _note_slow_flights(fleet, progress)
+        _note_limits(fleet, progress)
         with JournalFile(folder, hash_record(config)) as journal:
             flight = _FleetFlight(fleet, folder, journal)
             flight.fly(engine, progress)
@@ -209,28 +207,21 @@ def fly_fleet(
     )
 
 
-def _note_fixed_transitions(fleet: Fleet, progress: Progress) -> None:
-    """Notify the user of groups whose transitions `fleet learn` cannot learn, and why."""
+def _note_limits(fleet: Fleet, progress: Progress) -> None:
+    """Notify the user of groups that learn no transitions, and of those that fly slowly."""
     for group in fleet.groups:
-        reason = reason_transitions_are_fixed(group.scenarios[0])
+        scenario = group.scenarios[0]
+        reason = reason_transitions_are_fixed(scenario)
         if reason:
             progress.note(
                 f"{group.name}: `fleet learn` leaves the transitions as assumed: {reason}."
             )
-
-
-def _note_slow_flights(fleet: Fleet, progress: Progress) -> None:
-    """Notify the user of groups that fly one twin after the other, and why."""
-    for group in fleet.groups:
-        if group.observations or len(group.members) < 2:
-            continue
-        reason = reason_flown_one_by_one(group.scenarios[0], fleet.parts)
-        if not reason:
-            continue
-        progress.note(
-            f"{group.name}: the {len(group.members)} twins fly one after the other because "
-            f"{reason}, which takes many times as long as side by side."
-        )
+        reason = reason_flown_one_by_one(scenario, fleet.parts)
+        if reason and not group.observations and len(group.members) > 1:
+            progress.note(
+                f"{group.name}: the {len(group.members)} twins fly one after the other because "
+                f"{reason}, which takes many times as long as side by side."
+            )
 
 
 def endings_of(folder: Path) -> tuple[dict[str, str], dict[str, str]]:
@@ -296,8 +287,15 @@ def prepare_kit(
         policy = parts.policy_for(build_graphical_model(located))
         knowledge = prepare_knowledge(located, source, scenario.mission.seed, policy, parts)
         save_knowledge(folder, knowledge)
-        if not is_real and not reason_flown_one_by_one(scenario, parts):
-            _note_likelihood_of_single_observations(knowledge.sensor_model)
+        sensor_model = knowledge.sensor_model
+        is_slow = sensor_model.takes_observations_one_by_one
+        if is_slow and not is_real and not reason_flown_one_by_one(scenario, parts):
+            _note_once(
+                f"The sensor model {type(sensor_model).__qualname__} has only `log_likelihood`, "
+                "which is asked for one twin after the other: to be as fast as that of the "
+                "scenario, implement `log_likelihood_sequence(observations, control_index)` in "
+                "its place, (rows, sensors) and (rows,) -> (rows, states)."
+            )
     model = None
     if flies_model(scenario) and not is_real and isinstance(source, ReducedModelSource):
         model = source.prepared_model
@@ -314,17 +312,6 @@ def prepare_kit(
             f"that fly ({error}): define the class or function at the top of a module, or give "
             "its name FILE.py:NAME."
         ) from error
-
-
-def _note_likelihood_of_single_observations(sensor_model: GaussianSensorModel) -> None:
-    """Notify the user how a sensor model that evaluates one twin at a time becomes faster."""
-    if sensor_model.takes_observations_one_by_one:
-        _note_once(
-            f"The sensor model {type(sensor_model).__qualname__} has only `log_likelihood`, which "
-            "is asked for one twin after the other: to be as fast as that of the scenario, "
-            "implement `log_likelihood_sequence(observations, control_index)` in its place, "
-            "(rows, sensors) and (rows,) -> (rows, states)."
-        )
 
 
 @cache
@@ -429,18 +416,21 @@ class _FleetFlight:
         """
         for number, rows in shards:
             group = self._fleet.groups[number]
-            members = group.members[rows.start : rows.stop]
+            members = [*group.members[rows.start : rows.stop]]
             try:
                 kit = self._packed_kit(number, members[0].scenario_number)
-                members_with_recordings = tuple(
-                    _with_recording(group, member) for member in members
-                )
+                if group.observations:
+                    # Each member gets its recorded messages, so that workers read no files.
+                    for index, member in enumerate(members):
+                        if member.file is not None:
+                            messages = file_feed(member.file, group.scenarios[0]).messages(None)
+                            members[index] = replace(member, recording=tuple(messages))
             except FLIGHT_ERRORS as error:
                 if len(group.scenarios) == 1:
                     raise
                 self._store(number, members, result_of_unflown(members[0], str(error)))
             else:
-                yield Piece(number, kit, members_with_recordings)
+                yield Piece(number, kit, tuple(members))
 
     def _pack_kit(self, group_number: int, scenario_number: int) -> bytes:
         """Prepare a scenario of a group and return its packed kit."""
@@ -484,11 +474,3 @@ class _FleetFlight:
 def _with_group_name(group: Group, sentences: Mapping[str, str]) -> dict[str, str]:
     """Return sentences by GROUP/NAME, given sentences by the name of the twin."""
     return {f"{group.name}/{name}": sentence for name, sentence in sentences.items()}
-
-
-def _with_recording(group: Group, member: Member) -> Member:
-    """Return a member with its recorded messages, so that workers read no files."""
-    if not group.observations or member.file is None:
-        return member
-    messages = file_feed(member.file, group.scenarios[0]).messages(None)
-    return replace(member, recording=tuple(messages))

@@ -209,7 +209,14 @@ class Fleet:
         record = self.head.model_dump() | {"groups": [group.record() for group in self.groups]}
         parts = self.parts.record()
         if self.parts.policy is not None:
-            parts["policy"] = hash_record([self._policy_hash(group) for group in self.groups])
+            # The policy for the states and controls of each group.
+            hashes = []
+            for group in self.groups:
+                model = build_graphical_model(group.scenarios[0])
+                policy = self.parts.policy_for(model)
+                assert policy is not None
+                hashes.append(sha256(encode_policy(policy, model)).hexdigest())
+            parts["policy"] = hash_record(hashes)
         if parts:
             record["parts"] = parts
         if self.store:
@@ -238,13 +245,6 @@ class Fleet:
     def with_store(self, address: str) -> "Fleet":
         """Return the fleet with a store at an address, or in its folder if that is empty."""
         return replace(self, store=address)
-
-    def _policy_hash(self, group: Group) -> str:
-        """Return the hash of the given policy for the states and controls of a group."""
-        model = build_graphical_model(group.scenarios[0])
-        policy = self.parts.policy_for(model)
-        assert policy is not None
-        return sha256(encode_policy(policy, model)).hexdigest()
 
 
 def load_fleet(path: Path | str, seed: int | None = None) -> Fleet:
@@ -460,16 +460,12 @@ def _members(section: GroupSection, seed: int, observations: str, files: list[Pa
             )
         )
     if files:
-        return ListedMembers(
-            tuple(_member_with_file(section, seed, row, file) for row, file in enumerate(files))
-        )
+        members = []
+        for row, file in enumerate(files):  # each FMU or calibration makes a scenario of its own
+            member = seeded_member(section.name, seed, row, section.parameters, file.stem)
+            members.append(replace(member, scenario_number=row, file=file))
+        return ListedMembers(tuple(members))
     return CountedMembers(section.name, seed, section.count or 0, section.parameters)
-
-
-def _member_with_file(section: GroupSection, seed: int, row: int, file: Path) -> Member:
-    """Return an asset with its own FMU or calibration, and so its own scenario."""
-    member = seeded_member(section.name, seed, row, section.parameters, file.stem)
-    return replace(member, scenario_number=row, file=file)
 
 
 def recording_files(pattern: str) -> list[Path]:

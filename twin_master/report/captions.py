@@ -216,29 +216,25 @@ def caption_calibration(run: Run, figure: Figure) -> ReportFigure:
     truth_sentence = ""
     if truth is not None:
         truth_sentence = f"The asset flown has {number(truth)}, which the twin does not know."
+    test = load_test(run)
+    load_test_sentence = ""
+    if test is not None:
+        load_test_sentence = (
+            f"a: {len(test.load)} measured pairs of load and displacement, and the calibrated tip "
+            f"stiffness {test.stiffness:.1f} ± {test.stiffness_deviation:.1f} N/m "
+            "(band: two standard deviations). b:"
+        )
     return WORDS.figure(
         "calibration",
         figure,
         before_flight=" before the flight" if run.learnt_quantities else "",
-        load_test=_load_test_sentence(run),
+        load_test=load_test_sentence,
         parameter=parameter_title(run.scenario.calibration.parameter),
         unit="dimensionless" if unit == "1" else unit,
         draw_count=len(draws),
         mean=number(float(draws.mean())),
         standard_deviation=number(float(draws.std())),
         truth=truth_sentence,
-    )
-
-
-def _load_test_sentence(run: Run) -> str:
-    """Return the caption of the static load test of a calibration; empty if it has none."""
-    test = load_test(run)
-    if test is None:
-        return ""
-    return (
-        f"a: {len(test.load)} measured pairs of load and displacement, and the calibrated tip "
-        f"stiffness {test.stiffness:.1f} ± {test.stiffness_deviation:.1f} N/m "
-        "(band: two standard deviations). b:"
     )
 
 

@@ -63,31 +63,31 @@ def _decision_sentence(run: Run) -> str:
     initial_control = run.controls[int(run.control_index[0])]
     if len(run.controls) == 1:
         return f"There was one control, {initial_control}, and nothing to decide."
-    fallback = _fallback(run)
+    fallback = Fallback()  # empty if the true state is not known
+    if run.true_state is not None:
+        fallback = find_fallback(
+            run.model.states,
+            run["policy/control_index"].astype(np.int64),
+            int(run.control_index[0]),
+            run.control_index,
+            run.true_state,
+        )
     switch = _policy_switch(run, fallback)
     fell_back = fallback.fallback_step is not None and fallback.early_change_step is None
     if fell_back and switch is not None and not switch.is_always_reached:
         sentence = _fallback_clause(run, fallback, switch)
     else:
-        sentence = _control_clause(run) + _switch_clause(run, fallback, switch)
-    unheeded_requests = _unheeded_requests(run)
-    if unheeded_requests:
-        count = _one_or_count(unheeded_requests, run.step_word)
-        sentence += f"; at {count} the twin had asked for another control"
+        sentence = f"{_subject(run)} kept {initial_control} at every {run.step_word}"
+        if np.any(np.diff(run.control_index)):
+            sentence = f"{_subject(run)} {_changes_of_control(run)}"
+        sentence += _switch_clause(run, fallback, switch)
+    if run.is_watched:  # a real asset may have another control than its twin has asked for
+        requested_control = np.argmax(run["filtered/decision_probability"][:-1], axis=1)
+        unheeded_requests = int(np.count_nonzero(requested_control != run.control_index[1:]))
+        if unheeded_requests:
+            count = _one_or_count(unheeded_requests, run.step_word)
+            sentence += f"; at {count} the twin had asked for another control"
     return f"{sentence}."
-
-
-def _fallback(run: Run) -> Fallback:
-    """Find the fallback to a gentler control; empty if the true state is not known."""
-    if run.true_state is None:
-        return Fallback()
-    return find_fallback(
-        run.model.states,
-        run["policy/control_index"].astype(np.int64),
-        int(run.control_index[0]),
-        run.control_index,
-        run.true_state,
-    )
 
 
 def _policy_switch(run: Run, fallback: Fallback) -> _PolicySwitch | None:
@@ -139,14 +139,6 @@ def _fallback_clause(run: Run, fallback: Fallback, switch: _PolicySwitch) -> str
     return f"{fell_back} {time_text} {switch.factor} had reached {switch.level}"
 
 
-def _control_clause(run: Run) -> str:
-    """Return the clause on the flown controls and their changes."""
-    if np.any(np.diff(run.control_index)):
-        return f"{_subject(run)} {_changes_of_control(run)}"
-    control = run.controls[int(run.control_index[0])]
-    return f"{_subject(run)} kept {control} at every {run.step_word}"
-
-
 def _switch_clause(run: Run, fallback: Fallback, switch: _PolicySwitch | None) -> str:
     """Return the clause on the step in which the damage reached the level of another control.
 
@@ -170,14 +162,6 @@ def _switch_clause(run: Run, fallback: Fallback, switch: _PolicySwitch | None) -
     # The steps of a fallback count from the first step of the run, those of the report from 0.
     step_number = run.first_step + fallback.step_at_switch_level
     return f"; {switch.factor} reached {level} at {run.step_word} {step_number}"
-
-
-def _unheeded_requests(run: Run) -> int:
-    """Count the steps in which a real asset had another control than its twin had asked for."""
-    if not run.is_watched:
-        return 0
-    requested_control = np.argmax(run["filtered/decision_probability"][:-1], axis=1)
-    return int(np.count_nonzero(requested_control != run.control_index[1:]))
 
 
 def _belief_sentence(run: Run) -> str:

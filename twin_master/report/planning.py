@@ -83,7 +83,12 @@ def plan_figure(policy: BeliefPolicy, model: GraphicalModel) -> Figure:
             vmin=-0.5,
             vmax=count - 0.5,
         )
-        _name_corners(axes)
+        # The corners stand for the levels of the factor.
+        axes.text(0.0, -0.06, "lowest", ha="center", va="top")
+        axes.text(1.0, -0.06, "highest", ha="center", va="top")
+        axes.text(0.5, 0.9, "not known", ha="center", va="bottom")
+        axes.set_aspect("equal")
+        axes.set_axis_off()
         style.panel_label(axes, "abc"[factor], f"Belief of {name}")
     handles = style.swatches(model.controls, colors)
     figure.legend(handles=handles, loc="lower center", ncols=count, handlelength=1.4)
@@ -97,15 +102,6 @@ def _triangle_weights() -> Float:
         fractions += [(i, j) for j in range(_POINT_ROWS + 1 - i)]
     weights_of_two = np.array(fractions) / _POINT_ROWS
     return np.column_stack((1.0 - weights_of_two.sum(axis=1), weights_of_two))
-
-
-def _name_corners(axes: Axes) -> None:
-    """Label the corners of a triangle with the level of the factor."""
-    axes.text(0.0, -0.06, "lowest", ha="center", va="top")
-    axes.text(1.0, -0.06, "highest", ha="center", va="top")
-    axes.text(0.5, 0.9, "not known", ha="center", va="bottom")
-    axes.set_aspect("equal")
-    axes.set_axis_off()
 
 
 @style.publication_style()
@@ -137,23 +133,19 @@ def design_figure(
     figure = style.new_figure(2.6)
     width_ratios = [1] if places is None else [2, 3]
     panels = figure.subplots(1, len(width_ratios), squeeze=False, width_ratios=width_ratios)[0]
-    _draw_information(panels[0], information, information_of_all, names)
-    if places is not None:
-        _draw_chosen_sensors(panels[1], places, chosen_sensors, outlines)
-    figure.tight_layout()
-    return figure
 
-
-def _draw_information(
-    axes: Axes, information: Sequence[float], information_of_all: float, names: Sequence[str]
-) -> None:
-    """Draw the information [bit] of the first n chosen sensors over n, and of all candidates."""
+    # The information of the first n chosen sensors over n, and of all candidates
+    axes = panels[0]
     number = np.arange(1, len(information) + 1)
     axes.plot(number, information, "o-", color=style.PRESENT)
     axes.axhline(information_of_all, color=style.REFERENCE, linestyle="--", label="all candidates")
     axes.set(xlabel="sensors", ylabel="expected information [bit]", ylim=(0.0, None))
     axes.set_xticks(number, names, rotation=60)
     axes.legend(loc="lower right")
+    if places is not None:
+        _draw_chosen_sensors(panels[1], places, chosen_sensors, outlines)
+    figure.tight_layout()
+    return figure
 
 
 def _draw_chosen_sensors(

@@ -341,7 +341,9 @@ def mesh_figure(run_folder: Path, residual: Float) -> StructurePicture:
         1, 1, 0.55 * style.FULL_WIDTH, 0.05, 0.05, left=0.1, right=0.9
     )
     surface = _draw_surface(axes, field, displaced_points, camera)
-    gauges = _run_gauge_places(run_folder)
+    # The structure of the twin's model is preferred to that of the asset.
+    structure_files = (run_folder / name for name in (MODEL_COPY, FLOWN_COPY))
+    gauges = gauge_places(next((file for file in structure_files if file.is_file()), None))
     if gauges is not None and len(gauges) == len(residual):
         distance = np.linalg.norm(points[:, None] - gauges, axis=2)  # (nodes, gauges)
         nearest_node = np.argmin(distance, axis=0)
@@ -390,18 +392,6 @@ def _draw_surface(
     )
     axes.add_collection(surface)
     return surface
-
-
-def _run_gauge_places(run_folder: Path) -> Float | None:
-    """Return the positions (G, 3) [m] of the gauges in the structure file of a run folder.
-
-    The structure of the twin's model is preferred to that of the asset. Return None if the folder
-    has no structure file, or if the file describes no mesh.
-    """
-    for name in (MODEL_COPY, FLOWN_COPY):
-        if (run_folder / name).is_file():
-            return gauge_places(run_folder / name)
-    return None
 
 
 def gauge_places(file: Path | None) -> Float | None:

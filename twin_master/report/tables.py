@@ -1,7 +1,6 @@
 """The tables of a report: columns, cells, and the fields of titles and captions in `words.toml`."""
 
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import numpy as np
 
@@ -195,52 +194,24 @@ def run_table(run: Run, seed: object) -> Table:
     return item_table(rows, **WORDS.words("tables", "run"))
 
 
-class _Monitor(NamedTuple):
-    """A further quantity that a simulated asset reports in each step.
+def _monitor_rows(run: Run) -> list[tuple[str, str]]:
+    """Return a row with the largest value of each quantity that a simulated asset reported.
 
-    Attributes
-    ----------
-    title : str
-        The name of the quantity in words.
-    values : (T,) array
-        The values in the printed unit; NaN in steps without one.
-    unit : str
-        The unit as it is printed.
+    These are quantities with a unit, one value for each step. The bound of the strain error is
+    dimensionless in the store and is printed in microstrain.
     """
-
-    title: str
-    values: Float
-    unit: str
-
-
-def _monitors(run: Run) -> list[_Monitor]:
-    """Return the quantities with a unit that a simulated asset reported, one value for each step.
-
-    The bound of the strain error is dimensionless in the store and is printed in microstrain.
-    """
+    rows: list[tuple[str, str]] = []
     if run.true_state is None:
-        return []
-    monitors = []
+        return rows
     for name, variable in run.tree["truth"].data_vars.items():
-        title = str(name).replace("_", " ")
         values = np.asarray(variable.values)
         unit = variable.attrs.get("units", "1")
-        if variable.dims != ("step",):
-            continue
         if name == "strain_error_bound":
-            monitors.append(_Monitor(title, _MICROSTRAIN * values, "µε"))
-        elif unit != "1":
-            monitors.append(_Monitor(title, values, unit))
-    return monitors
-
-
-def _monitor_rows(run: Run) -> list[tuple[str, str]]:
-    """Return a row with the largest value of each quantity that the asset reported."""
-    rows = []
-    for monitor in _monitors(run):
-        if np.isfinite(monitor.values).any():
-            largest = float(np.nanmax(monitor.values))
-            rows.append((f"largest {monitor.title}", f"{largest:.3g} {monitor.unit}"))
+            values = _MICROSTRAIN * values
+            unit = "µε"
+        if variable.dims == ("step",) and unit != "1" and np.isfinite(values).any():
+            title = str(name).replace("_", " ")
+            rows.append((f"largest {title}", f"{float(np.nanmax(values)):.3g} {unit}"))
     return rows
 
 

@@ -269,42 +269,26 @@ class Flight:
                 self._learnt_steps.append(self.steps)
             self._lines_of_steps.append(_StepLines(belief=begin, observation=begin))
             return
-        if has_belief:
-            self._add_late_observation(record, begin)
-        else:
-            self._add_event(record, begin)
         self.number += 1
-
-    def _add_late_observation(self, record: StepRecord, begin: int) -> None:
-        """Add the line of an observation that came late.
-
-        The line has the late observation of an earlier step, and the belief of the last step, which
-        the twin has filtered again with it.
-
-        Raises
-        ------
-        RunFolderError
-            If the line does not belong to the last step, or observes a later one.
-        """
         last_step = self.steps - 1
-        observed_step = int(record.get("observation_step", int(record["step"])))
-        if not 0 <= observed_step <= record["step"] == last_step:
-            step_name = self.scenario.mission.step_name
-            raise RunFolderError(
-                f"the journal in {self.folder} has a line of {step_name} {record['step']} where "
-                f"{step_name} {self.steps} is expected: it was written by another version, or is "
-                "damaged."
-            )
-        self._lines_of_steps[-1].belief = begin
-        self._lines_of_steps[observed_step].observation = begin
+        if has_belief:
+            # The late observation of an earlier step, and the belief of the last step, which the
+            # twin has filtered again with it
+            observed_step = int(record.get("observation_step", int(record["step"])))
+            if not 0 <= observed_step <= record["step"] == last_step:
+                step_name = self.scenario.mission.step_name
+                raise RunFolderError(
+                    f"the journal in {self.folder} has a line of {step_name} {record['step']} "
+                    f"where {step_name} {self.steps} is expected: it was written by another "
+                    "version, or is damaged."
+                )
+            self._lines_of_steps[-1].belief = begin
+            self._lines_of_steps[observed_step].observation = begin
+            return
 
-    def _add_event(self, record: StepRecord, begin: int) -> None:
-        """Add a line that is not a step: notices, a verdict, or a changed model.
-
-        Its notices are shown with the last step before it. If its verdict has a drawing of the
-        missing force, the drawing is added.
-        """
-        step = max(self.steps - 1, 0)
+        # An event: its notices are shown with the last step before it, and the drawing of the
+        # missing force of its verdict is added.
+        step = max(last_step, 0)
         self._later_notices[step] += record.get("notices", [])
         verdict_folder = record.get("verdict", {}).get("folder", "")
         if "model" in record:

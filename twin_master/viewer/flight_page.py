@@ -238,18 +238,18 @@ class FlightPage:
         beliefs = flight.beliefs_in(records)
         values = self._plotted_values(beliefs, flight.observations_in(records))
         values["control"] = [record["control_index"] for record in records]
-        values["notices"] = [self._sentences_in(record) for record in records]
+        sentences_of_steps = []
+        for record in records:
+            # Commands in notices name the folder as DIR.
+            sentences = [
+                notice["sentence"].replace(" DIR", f" {flight.folder}")
+                for notice in record["notices"]
+            ]
+            sentences_of_steps.append(sentences)
+        values["notices"] = sentences_of_steps
         values["learnt"] = [record.get("learnt", {}) for record in records]
         values["truth"] = self._factor_scales * flight.true_states_in(records)
         return values
-
-    def _sentences_in(self, record: StepRecord) -> list[str]:
-        """Return the sentences of the notices of a step.
-
-        Commands in them name the folder as DIR, which is replaced by the folder of the flight.
-        """
-        folder = f" {self._flight.folder}"
-        return [notice["sentence"].replace(" DIR", folder) for notice in record["notices"]]
 
     def _plotted_values(
         self, beliefs: StepBeliefs, observations: Float | None

@@ -156,7 +156,16 @@ class Watch:
         self.journal_path = folder / JOURNAL_NAME
         self._config_hash = hash_record(self.config)
         self.update_from_journal()
-        self._keep_knowledge(sibling)
+
+        # The knowledge of all models, for viewers. The file of a sibling is linked if neither watch
+        # has adopted a patch.
+        has_same_knowledge = sibling is not None and len(self.models) == len(sibling.models) == 1
+        if sibling is not None and has_same_knowledge:
+            link_knowledge(sibling.folder, folder)
+        else:
+            save_knowledge(folder, self.models[-1].knowledge)
+        for number, model in enumerate(self.models[:-1]):
+            save_knowledge(folder, model.knowledge, number)
 
     def _prepare_model(self) -> BelievedModel:
         """Calibrate and plan, and return the first model of the watch."""
@@ -169,20 +178,6 @@ class Watch:
             self.progress.note(remark)
         patch = getattr(self.scenario.belief, "patch", None)
         return BelievedModel(0, knowledge, Path(patch) if patch else None)
-
-    def _keep_knowledge(self, sibling: "Watch | None") -> None:
-        """Write the knowledge of all models to the folder, for viewers.
-
-        If neither this watch nor its sibling has adopted a patch, the file of the sibling is
-        linked.
-        """
-        has_same_knowledge = sibling is not None and len(self.models) == len(sibling.models) == 1
-        if sibling is not None and has_same_knowledge:
-            link_knowledge(sibling.folder, self.folder)
-        else:
-            save_knowledge(self.folder, self.models[-1].knowledge)
-        for number, model in enumerate(self.models[:-1]):
-            save_knowledge(self.folder, model.knowledge, number)
 
     def update_from_journal(self) -> None:
         """Read the state of teaching from the journal, and load adopted models that are missing."""
@@ -280,17 +275,11 @@ class Watch:
             if patch is not None:
                 self._adopt_given(patch)
             yield
-            self._write_last_counts()
-
-    def _write_last_counts(self) -> None:
-        """Write the counts of messages after the last line to the journal.
-
-        If the disk is full, the counts are lost, but no observation.
-        """
-        if self.intake.state()["counts"] == self._written_intake["counts"]:
-            return
-        with suppress(FileNotWrittenError):
-            self.write_event()
+            # The counts of messages after the last line. If the disk is full, they are lost, but no
+            # observation.
+            if intake.state()["counts"] != self._written_intake["counts"]:
+                with suppress(FileNotWrittenError):
+                    self.write_event()
 
     def decisions(self) -> Iterator[JsonObject]:
         """Yield the decision of each step, once it is in the journal, until the feed ends.

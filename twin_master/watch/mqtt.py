@@ -108,8 +108,11 @@ class Topic(Feed):
         self._journal = watch.folder / JOURNAL_NAME
         _, journal_size = last_step(self._journal)
         if not self._path.is_file():  # then the decisions so far count as published
-            _write_size(self._path, journal_size)
-        self._acknowledged_size = min(_read_size(self._path), journal_size)
+            # 20 digits are enough for any size, so that `_overwrite_size` never changes the length.
+            atomic_write_text(self._path, f"{journal_size:020d}\n")
+        text = self._path.read_text(encoding="utf-8", errors="replace").strip()
+        size = int(text) if text.isdecimal() else 0  # the file may be damaged
+        self._acknowledged_size = min(size, journal_size)
         self._sent_size = journal_size
         self.resend_unacknowledged()
         if self._acknowledged_size == journal_size:
@@ -199,24 +202,10 @@ class Topic(Feed):
         self._end_of_pause = 0.0
 
 
-def _write_size(path: Path, size: int) -> None:
-    """Create the file `published` with a size.
-
-    It has 20 digits, enough for any size, so that `_overwrite_size` never changes its length.
-    """
-    atomic_write_text(path, f"{size:020d}\n")
-
-
 def _overwrite_size(path: Path, size: int) -> None:
     """Overwrite the size in the file `published`; a kill leaves the old or the new one."""
     with explained_write_errors(path), path.open("r+b") as file:
         file.write(b"%020d\n" % size)
-
-
-def _read_size(path: Path) -> int:
-    """Return the size in the file `published`; 0 if it is damaged."""
-    text = path.read_text(encoding="utf-8", errors="replace").strip()
-    return int(text) if text.isdecimal() else 0
 
 
 class MqttFeed(Topic):

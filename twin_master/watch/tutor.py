@@ -101,7 +101,13 @@ class Tutor:
         does not wait for it, a later call finds it.
         """
         if self.outcome is None:
-            self.outcome = self._begin_trial(verdict)
+            patch = self._watch.folder / verdict["folder"] / PATCH
+            compared = ComparedSteps(first=verdict["step"] + 1, count=TRIAL_STEPS)
+            worker = ThreadPoolExecutor(1)
+            self.outcome = worker.submit(
+                self._watch.trial_of(patch, verdict["from_step"], compared)
+            )
+            worker.shutdown(wait=self._wait)
         if not self.outcome.done():
             return
         computed_outcome = self.outcome
@@ -116,15 +122,6 @@ class Tutor:
             self._watch.adopt(outcome, Notice("trial", sentence).as_record())
         else:
             self._reject(verdict, sentence)
-
-    def _begin_trial(self, verdict: VerdictRecord) -> Future[PatchOutcome]:
-        """Begin to compute the outcome of the patch of a verdict in a thread."""
-        patch = self._watch.folder / verdict["folder"] / PATCH
-        compared = ComparedSteps(first=verdict["step"] + 1, count=TRIAL_STEPS)
-        worker = ThreadPoolExecutor(1)
-        outcome = worker.submit(self._watch.trial_of(patch, verdict["from_step"], compared))
-        worker.shutdown(wait=self._wait)
-        return outcome
 
     def _reject(self, verdict: VerdictRecord, sentence: str) -> None:
         """Record in the journal that the patch of a verdict is not adopted, and why."""

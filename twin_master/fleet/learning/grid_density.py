@@ -6,7 +6,7 @@ from functools import cached_property
 
 import numpy as np
 
-from reporting.arrays import Float, Index
+from reporting.arrays import Float
 
 Axes = tuple[Float, ...]
 """The axes of a tensor grid, an array of equally spaced values for each."""
@@ -149,19 +149,30 @@ def resolve_density(
         values = log_density(axes)
     while True:
         weight = cell_probabilities(values)
-        # For each axis: the range of its relevant points, and whether the grid is fine enough.
+        # For each axis: the range of its relevant points, whether this range is notably shorter,
+        # and whether the grid is fine enough.
         ranges = []
+        would_shrink = False
         is_resolved = True
         for number, axis in enumerate(axes):
             other_axes = tuple(
                 other_number for other_number in range(len(axes)) if other_number != number
             )
-            highest = values.max(axis=other_axes)
-            relevant = np.flatnonzero(highest > values.max() - RELEVANT_DROP)
-            ranges.append(_relevant_range(axis, relevant, bounds[number]))
-            is_fine = _is_fine(axis, weight.sum(axis=other_axes))
+            profile = values.max(axis=other_axes)
+            relevant = np.flatnonzero(profile > values.max() - RELEVANT_DROP)
+            # Each end of the range is moved outwards by three quarters of a step. With a whole
+            # step, the range of a grid of few points would hardly become smaller than the axis.
+            step = axis[1] - axis[0]
+            lowest, highest = bounds[number]
+            low = max(lowest, axis[relevant[0]] - 0.75 * step)
+            high = min(highest, axis[relevant[-1]] + 0.75 * step)
+            ranges.append((low, high))
+            would_shrink |= bool(high - low <= LEAST_SHRINKAGE * (axis[-1] - axis[0]))
+            marginal = weight.sum(axis=other_axes)
+            deviation = np.sqrt(marginal @ (axis - marginal @ axis) ** 2)
+            is_fine = bool(step <= RESOLVED_SPACING * deviation)
             is_resolved &= is_fine and len(relevant) >= len(axis) // 3
-        if is_resolved or not _would_shrink(axes, ranges):
+        if is_resolved or not would_shrink:
             return axes, values
         axes = tuple(
             np.linspace(low, high, len(axis))
@@ -189,37 +200,6 @@ def _twice_as_wide(axes: Axes, bounds: Sequence[tuple[float, float]]) -> Axes:
         high = min(highest, axis[-1] + half_length)
         wider_axes.append(np.linspace(low, high, len(axis)))
     return tuple(wider_axes)
-
-
-def _relevant_range(
-    axis: Float, relevant: Index, bounds: tuple[float, float]
-) -> tuple[float, float]:
-    """Return the range of the relevant points of an axis, widened at both ends, within its bounds.
-
-    Each end is moved outwards by three quarters of a step. With a whole step, the range of a grid
-    of few points would hardly become smaller than the axis.
-    """
-    lowest, highest = bounds
-    step = axis[1] - axis[0]
-    low = max(lowest, axis[relevant[0]] - 0.75 * step)
-    high = min(highest, axis[relevant[-1]] + 0.75 * step)
-    return low, high
-
-
-def _is_fine(axis: Float, marginal: Float) -> bool:
-    """Return whether the points of an axis lie close enough for its marginal distribution (N,)."""
-    step = axis[1] - axis[0]
-    mean = marginal @ axis
-    deviation = np.sqrt(marginal @ (axis - mean) ** 2)
-    return bool(step <= RESOLVED_SPACING * deviation)
-
-
-def _would_shrink(axes: Axes, ranges: Sequence[tuple[float, float]]) -> bool:
-    """Return whether any range is notably shorter than its axis."""
-    return not all(
-        high - low > LEAST_SHRINKAGE * (axis[-1] - axis[0])
-        for (low, high), axis in zip(ranges, axes, strict=True)
-    )
 
 
 def cell_probabilities(log_density: Float) -> Float:

@@ -47,7 +47,6 @@ from twin_master.fleet.reading import TwinsOfScenario, flown_twins, notice_count
 from twin_master.fleet.storage.store import check_installed, flown_rows, open_group
 from twin_master.fleet.storage.store_layout import StoredObservations, row_blocks, stored_values
 from twin_master.run_folder import to_json
-from twin_master.scenario.schema import Scenario
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -246,30 +245,19 @@ def _records(lessons: dict[str, _GroupLessons]) -> JsonObject:
     """
     grids = [lesson.grid for lesson in lessons.values() if lesson.grid is not None]
     distinct_names = {lesson.family.names for lesson in lessons.values()}
-    have_same_probabilities = len(distinct_names) == 1
-    if have_same_probabilities and len(grids) > 1:
-        (names,) = distinct_names
-        if len(names) <= _MOST_SHARED:
-            return _records_with_shared_distribution(lessons, grids, names)
+    names = distinct_names.pop()
+    is_shared = not distinct_names and len(grids) > 1 and len(names) <= _MOST_SHARED
     records = {}
-    for name, lesson in lessons.items():
-        records[name] = lesson.with_probabilities(lesson.marginals, lesson.flown_controls)
-    return {"groups": records}
-
-
-def _records_with_shared_distribution(
-    lessons: dict[str, _GroupLessons], grids: Sequence[LikelihoodGrid], names: Sequence[str]
-) -> JsonObject:
-    """Return the records of groups whose probabilities share a distribution.
-
-    A control that was flown in any group counts as flown in all, because the shared distribution
-    transfers what was learnt to the other groups.
-    """
+    if not is_shared:
+        for name, lesson in lessons.items():
+            records[name] = lesson.with_probabilities(lesson.marginals, lesson.flown_controls)
+        return {"groups": records}
     posterior = shared_posterior(grids)
+    # A control that was flown in any group counts as flown in all, because the shared distribution
+    # transfers what was learnt to the other groups.
     flown_controls: set[str] = set()
     for lesson in lessons.values():
         flown_controls |= lesson.flown_controls
-    records = {}
     for (name, lesson), probabilities in zip(lessons.items(), posterior.groups, strict=True):
         records[name] = lesson.with_probabilities(probabilities, flown_controls)
     shared_distribution = dict(zip(names, posterior.hyperparameters, strict=True))
@@ -308,7 +296,11 @@ class _FlownGroup:
         is the distribution of the calibrated parameter over the assets.
         """
         scenario = self.twins_by_scenario[0].knowledge.scenario
-        family = _transition_family(scenario)
+        reason_for_fixed = reason_transitions_are_fixed(scenario)
+        if reason_for_fixed:
+            family = TransitionFamily.fixed(scenario, reason_for_fixed)
+        else:
+            family = TransitionFamily.learnable(scenario)
         nodes = None
         if len(self.twins_by_scenario) == 1:  # otherwise each twin has a calibration of its own
             nodes = parameter_nodes(self.twins_by_scenario[0], is_real="recordings" in self.record)
@@ -427,14 +419,6 @@ class _FlownGroup:
             for rows in evidence.evidence_of_draws(probability):
                 log_evidence.append(rows)
             return population_posterior(nodes.values, log_evidence, self._draws.standard_deviation)
-
-
-def _transition_family(scenario: Scenario) -> TransitionFamily:
-    """Return the transitions of a scenario as a function of the learnt probabilities."""
-    reason = reason_transitions_are_fixed(scenario)
-    if reason:
-        return TransitionFamily.fixed(scenario, reason)
-    return TransitionFamily.learnable(scenario)
 
 
 def _counts(group: "xr.DataTree", control_names: Sequence[str]) -> tuple[int, set[str]]:

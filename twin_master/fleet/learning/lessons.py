@@ -139,7 +139,21 @@ def lesson_rows(record: Record) -> list[LessonRow]:
 def _group_rows(group: Record) -> Iterator[LessonRow]:
     """Yield the rows of a group: probabilities of worsening, noise, and population moments."""
     for control, probability in group["probability"].items():
-        yield _probability_row(control, probability)
+        title = f"probability to worsen, {control}"
+        assumed = probability["assumed"]
+        if not probability["flown"]:
+            yield LessonRow("", title, f"{assumed:.4f}", "", "not flown")
+            continue
+        low = probability["lower_95"]
+        high = probability["upper_95"]
+        outside = "" if low <= assumed <= high else " (outside)"
+        yield LessonRow(
+            group="",
+            quantity=title,
+            assumed=f"{assumed:.4f}{outside}",
+            mean=f"{probability['mean']:.4f}",
+            interval=f"{low:.4f} to {high:.4f}",
+        )
     if "transitions_kept_because" in group:
         yield LessonRow("", "transitions", "as assumed", "not learnt", "")
     yield _value_row("noise over the assumed", "1", group["noise_factor"])
@@ -148,24 +162,6 @@ def _group_rows(group: Record) -> Iterator[LessonRow]:
         for moment in ("mean", "spread"):
             title = f"{population['parameter']}, {moment}"
             yield _value_row(title, "", population[moment])
-
-
-def _probability_row(control: str, probability: Record) -> LessonRow:
-    """Return the table row for the probability of worsening under a control."""
-    title = f"probability to worsen, {control}"
-    assumed = probability["assumed"]
-    if not probability["flown"]:
-        return LessonRow("", title, f"{assumed:.4f}", "", "not flown")
-    low = probability["lower_95"]
-    high = probability["upper_95"]
-    outside = "" if low <= assumed <= high else " (outside)"
-    return LessonRow(
-        group="",
-        quantity=title,
-        assumed=f"{assumed:.4f}{outside}",
-        mean=f"{probability['mean']:.4f}",
-        interval=f"{low:.4f} to {high:.4f}",
-    )
 
 
 def _value_row(title: str, assumed: str, learnt: Record) -> LessonRow:

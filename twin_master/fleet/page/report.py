@@ -214,49 +214,35 @@ def _opening_sentences(overviews: Sequence[GroupOverview]) -> list[str]:
     asset_count = sum(overview.twin_count for overview in overviews)
     flown_count = sum(overview.flown_count for overview in overviews)
     step_word = overviews[0].urgent.scenario.mission.step_name
-    sentences = [
-        f"{flown_count} of {counted(asset_count, 'asset')} have flown.",
-        _alarm_sentence(step_word, overviews),
-        _fallback_sentence(step_word, overviews),
-        _damage_sentence(overviews),
-    ]
-    return [sentence for sentence in sentences if sentence]
+    sentences = [f"{flown_count} of {counted(asset_count, 'asset')} have flown."]
 
+    # The assets with an alarm, and the first step of one
+    alarms = [overview.first_alarm for overview in overviews if overview.first_alarm is not None]
+    if alarms:
+        alarmed = counted(sum(overview.alarmed_count for overview in overviews), "asset")
+        sentences.append(f"{alarmed} raised an alarm, first in {step_word} {min(alarms)}.")
 
-def _alarm_sentence(step_word: str, overviews: Sequence[GroupOverview]) -> str:
-    """Return the number of assets with an alarm and the first step of one; empty without alarms."""
-    steps = [overview.first_alarm for overview in overviews if overview.first_alarm is not None]
-    if not steps:
-        return ""
-    alarmed_count = sum(overview.alarmed_count for overview in overviews)
-    return f"{counted(alarmed_count, 'asset')} raised an alarm, first in {step_word} {min(steps)}."
-
-
-def _fallback_sentence(step_word: str, overviews: Sequence[GroupOverview]) -> str:
-    """Return the fraction of fallbacks within `WITHIN` steps; empty if none was called for."""
+    # The fraction of fallbacks that came in time
     called_for_count = sum(overview.prompt_fallbacks.trials for overview in overviews)
-    if not called_for_count:
-        return ""
-    prompt_count = sum(overview.prompt_fallbacks.hits for overview in overviews)
-    fraction_in_time = prompt_count / called_for_count
-    return (
-        f"In {counted(called_for_count, 'asset')} the damage called for another control; "
-        f"the fallback came within {WITHIN} {step_word}s of it in {100 * fraction_in_time:.0f} %."
-    )
+    if called_for_count:
+        prompt_count = sum(overview.prompt_fallbacks.hits for overview in overviews)
+        percentage = 100 * (prompt_count / called_for_count)
+        sentences.append(
+            f"In {counted(called_for_count, 'asset')} the damage called for another control; "
+            f"the fallback came within {WITHIN} {step_word}s of it in {percentage:.0f} %."
+        )
 
-
-def _damage_sentence(overviews: Sequence[GroupOverview]) -> str:
-    """Return a sentence on the most severe damage; empty if no state is estimated."""
+    # The most severe damage, if a state is estimated
     candidates = [overview.most_damaged for overview in overviews]
     with_state = [candidate for candidate in candidates if candidate is not None]
-    if not with_state:
-        return ""
-    worst = max(with_state, key=lambda candidate: float(candidate.severity[0]))
-    states = []
-    for factor, mean in zip(printed_factors(worst.scenario), worst.mean[0], strict=True):
-        states.append(f"{factor.title} at {factor.scale * mean:.3g} {factor.unit}".rstrip())
-    name = worst.names[0]
-    return f"The asset with the most damage is {name} of {worst.group}: {', '.join(states)}."
+    if with_state:
+        worst = max(with_state, key=lambda candidate: float(candidate.severity[0]))
+        states = []
+        for factor, mean in zip(printed_factors(worst.scenario), worst.mean[0], strict=True):
+            states.append(f"{factor.title} at {factor.scale * mean:.3g} {factor.unit}".rstrip())
+        asset = f"{worst.names[0]} of {worst.group}"
+        sentences.append(f"The asset with the most damage is {asset}: {', '.join(states)}.")
+    return sentences
 
 
 def _watched_fleet_page(

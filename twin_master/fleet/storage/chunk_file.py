@@ -100,12 +100,14 @@ class ChunkFile:
             return
         remove_leftovers(self.path.parent)  # of a process that was killed here
         index = self._index()
-        ordered_index = self._ordered_index(index)
         has_chunk = index[:, 0] != _NO_CHUNK
         if not has_chunk.any():
             self.path.unlink()
             return
-        size = self._index_size + int(index[has_chunk, 1].sum())
+        lengths = index[has_chunk, 1]
+        ordered_index = index.copy()  # of a file with the same chunks in order and without gaps
+        ordered_index[has_chunk, 0] = self._index_size + np.cumsum(lengths) - lengths
+        size = self._index_size + int(lengths.sum())
         if np.array_equal(index, ordered_index) and self.path.stat().st_size == size:
             return
         with atomic_file(self.path) as temporary, temporary.open("wb") as target:
@@ -136,14 +138,6 @@ class ChunkFile:
                 f"the index of {self.path} is damaged: fly the fleet again with --replace."
             )
         return np.frombuffer(numbers, dtype="<u8").reshape(-1, 2).copy()
-
-    def _ordered_index(self, index: Unsigned) -> Unsigned:
-        """Return the index of a file that has the same chunks in order and without gaps."""
-        has_chunk = index[:, 0] != _NO_CHUNK
-        lengths = index[has_chunk, 1]
-        ordered_index = index.copy()
-        ordered_index[has_chunk, 0] = self._index_size + np.cumsum(lengths) - lengths
-        return ordered_index
 
 
 def _encoded_index(index: Unsigned) -> bytes:

@@ -298,11 +298,13 @@ def open_group(folder: Path, group: str, *, names: bool = True) -> "xr.DataTree"
     required_paths = {
         path for path in SCHEMA["fleet"] if "{" not in path and not path.startswith("earned/")
     }
-    missing_paths = [path for path in sorted(required_paths) if path not in _paths_of(tree)]
-    if missing_paths:
+    for node in tree.subtree:
+        for name in node.data_vars:
+            required_paths.discard(f"{node.relative_to(tree)}/{name}".removeprefix("./"))
+    if required_paths:
         raise FleetError(
             f"{folder} was flown by another version of this program and lacks "
-            f"{', '.join(missing_paths)}: fly the fleet again with --replace, "
+            f"{', '.join(sorted(required_paths))}: fly the fleet again with --replace, "
             "or read it with that version."
         )
     return tree
@@ -315,12 +317,3 @@ def _group_record(config: JsonObject, folder: Path, group: str) -> JsonObject:
         if record["name"] == group:
             return record
     raise FleetError(f"{folder} holds no group {group} of a fleet.")
-
-
-def _paths_of(tree: "xr.DataTree") -> set[str]:
-    """Return the paths of all variables in a tree, such as "filtered/mean"."""
-    return {
-        f"{node.relative_to(tree)}/{name}".removeprefix("./")
-        for node in tree.subtree
-        for name in node.data_vars
-    }

@@ -117,13 +117,11 @@ class FileSource:
             return False
         for name in self._files:
             asset = self._watcher.assets.get(f"{self._group.name}/{name}")
-            if asset is not None and not self._is_read(asset):
+            if asset is None:
+                continue
+            if not asset.watch.intake.has_ended and not self._watcher.has_all_steps(asset):
                 return False
         return True
-
-    def _is_read(self, asset: WatchedAsset) -> bool:
-        """Return whether the file of an asset is read to its end or to the requested steps."""
-        return asset.watch.intake.has_ended or self._watcher.has_all_steps(asset)
 
     def look(self, *, for_new_assets: bool) -> int:
         """Process the new lines of all assets' files, and return the number of new steps.
@@ -135,22 +133,18 @@ class FileSource:
         """
         if for_new_assets:
             for path in recording_files(self._group.observations):
-                self._add_file(path)
+                name = asset_name(path)
+                if self._files.get(name, path) != path:
+                    error = FleetError("another file has the same name.")
+                    self._watcher.lose(f"{self._group.name}/{name} of {path.name}", error)
+                elif not self._follow or _has_whole_header(path):
+                    self._files[name] = path
         scenario = self._group.scenarios[0]  # real assets of a group share one scenario
         steps = 0
         for name, path in self._files.items():
             open_feed = partial(file_feed, path, scenario, follow=self._follow)
             steps += self._watcher.advance(self._group, name, open_feed, STEPS_AT_ONCE)
         return steps
-
-    def _add_file(self, path: Path) -> None:
-        """Add the file of an asset, unless its header is still being written."""
-        name = asset_name(path)
-        if self._files.get(name, path) != path:
-            error = FleetError("another file has the same name.")
-            self._watcher.lose(f"{self._group.name}/{name} of {path.name}", error)
-        elif not self._follow or _has_whole_header(path):
-            self._files[name] = path
 
 
 def _has_whole_header(path: Path) -> bool:

@@ -203,7 +203,9 @@ class FleetWatch:
                     if steps == 0:
                         if all(source.has_ended for source in self._sources):
                             return
-                        _pause_after(time.monotonic() - begin)
+                        # In proportion to the duration of the poll without new messages
+                        idle_seconds = (time.monotonic() - begin) / BUSY_SHARE
+                        time.sleep(min(max(IDLE_SECONDS, idle_seconds), LONGEST_IDLE))
             finally:
                 self._write_state()
 
@@ -394,8 +396,3 @@ def _record(fleet: Fleet) -> JsonObject:
         scenario = group.scenarios[0].portable().to_dict()
         groups.append({"name": group.name, "scenarios": [scenario]})
     return fleet.head.model_dump(exclude={"shard"}) | {"groups": groups}
-
-
-def _pause_after(look_seconds: float) -> None:
-    """Sleep after a poll without new messages, in proportion to the duration of the poll [s]."""
-    time.sleep(min(max(IDLE_SECONDS, look_seconds / BUSY_SHARE), LONGEST_IDLE))
