@@ -104,7 +104,7 @@ def flown_fleet(folder: Path) -> None:
     """Fly the fleet of the page on fleets with four twins."""
     text, *_ = blocks(ROOT / "docs" / "how_to" / "fleets.md", "toml")
     (folder / "fleet.toml").write_text(text.replace("count = 40", "count = 4"), encoding="utf-8")
-    command(folder, "fleet", "run", "fleet.toml", "--out", "runs/winter")
+    command(folder, "fleet", "run", "fleet.toml", "--out", "runs/winter", "--workers", "0", "--no-report")
 
 
 def calibrated_wing(folder: Path) -> None:

@@ -400,7 +400,9 @@ def to_svg(figure: Figure) -> bytes:
     buffer = io.BytesIO()
     with publication_style():
         _parse_tick_labels_of_powers(figure)
-        with annotated(figure) as annotate:
+        # Lays out the panels, which the drawing of the file then leaves where they are.
+        view_boxes = ", ".join(tile.view_box for tile in tiles_of_figure(figure))
+        with _fixed_layout(figure), annotated(figure) as annotate:
             # Matplotlib leaves out the block of metadata only if all four are None.
             figure.savefig(
                 buffer,
@@ -408,8 +410,7 @@ def to_svg(figure: Figure) -> bytes:
                 dpi=PNG_RESOLUTION,  # of the parts that are rasterised
                 metadata={"Date": None, "Creator": None, "Format": None, "Type": None},
             )
-        text = annotate(buffer.getvalue().decode("utf-8"))
-        view_boxes = ", ".join(tile.view_box for tile in tiles_of_figure(figure))
+            text = annotate(buffer.getvalue().decode("utf-8"))
     text = text.replace("<svg ", f'<svg data-tiles="{view_boxes}" ', 1)
     text = re.sub(r"<!DOCTYPE[^>]*>\s*", "", text, count=1)
     return text.encode("utf-8")
@@ -454,8 +455,25 @@ def save_figure(figure: ReportFigure, folder: Path, *, png: bool = True) -> Page
     drawn = page_figure(figure)
     atomic_write_bytes(folder / f"{figure.name}.svg", drawn.svg)
     if png:
-        atomic_write_bytes(folder / f"{figure.name}.png", to_png(figure.figure))
+        with _fixed_layout(figure.figure):  # that of the SVG
+            atomic_write_bytes(folder / f"{figure.name}.png", to_png(figure.figure))
     return drawn
+
+
+@contextmanager
+def _fixed_layout(figure: Figure) -> Iterator[None]:
+    """Keep the panels of a figure where they are within the context.
+
+    Matplotlib would draw everything once more for each file, only to lay the panels out anew.
+    """
+    engine = figure.get_layout_engine()
+    with publication_style():  # which asks for no engine
+        figure.set_layout_engine(None)
+    try:
+        yield
+    finally:
+        if engine is not None:
+            figure.set_layout_engine(engine)
 
 
 def _parse_tick_labels_of_powers(figure: Figure) -> None:

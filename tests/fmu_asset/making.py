@@ -31,7 +31,7 @@ from tests.kept import packed
 ROOT = Path(__file__).parents[2]
 HANGS = 600.0
 """After so long [s] a test hangs."""
-NEVER_ANSWERED = 5.0
+NEVER_ANSWERED = 2.0
 """Limit [s] of a call that an FMU never answers."""
 DESCRIPTION, XML = "modelDescription.xml", (".xml", ".ssd", ".ssv", ".ssm")
 

@@ -599,9 +599,9 @@ def test_the_figures_of_all_assets_are_served_for_prometheus(fleet_file, tmp_pat
     assert "Metrics: http://127.0.0.1:" in done.stderr
 
 
-WIDE = 80
+WIDE = 40
 """More wings than a process with `MOST_FILES` open files has room for."""
-MOST_FILES = 100
+MOST_FILES = 50
 WITH_FEW_FILES = (
     "import resource; "
     f"resource.setrlimit(resource.RLIMIT_NOFILE, ({MOST_FILES}, {MOST_FILES})); "
