@@ -137,19 +137,27 @@ class MotionEstimator:
         return self.tune_processes(laws, best_estimate, COARSE_FACTORS)
 
     def estimate_roughly(
-        self, laws: EffectLaws, start: EstimatorStart, small_processes: Processes
+        self,
+        laws: EffectLaws,
+        start: EstimatorStart,
+        small_processes: Processes,
+        *,
+        has_large_forces: bool,
     ) -> Estimate | None:
         """Return an estimate for a first comparison, after few steps.
 
         One estimate is made with the small missing forces that may remain beside the effects, and
-        others with the large ones of `start`, which are lowered in steps.
+        others with those of `start`, which are lowered in steps if they are large.
 
         Parameters
         ----------
         start : EstimatorStart
-            The values and trajectories to begin with, and large missing forces.
+            The values and trajectories to begin with, and the missing forces without the last
+            effect.
         small_processes : mapping of int to Process
             The small missing forces, by the index of the port.
+        has_large_forces : bool
+            Whether a force is missing without the last effect.
 
         Returns
         -------
@@ -161,6 +169,8 @@ class MotionEstimator:
         best_estimate = self.gauss_newton.iterate(
             laws, replace(start, processes=small_processes), narrow_window, MOST_ROUGH_ITERATIONS
         )
+        if best_estimate is not None and not has_large_forces:
+            return best_estimate
         window = FIRST_WINDOWS[-1] if laws.hold_at_rest else USUAL_WINDOW
         current_start = start
         largest_evidence = -inf

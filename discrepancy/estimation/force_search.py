@@ -379,6 +379,7 @@ class ForceSearch:
 
         Two searches begin at the motion of `base`: one with its missing forces, which are lowered
         step by step, the other with `processes`, which are small. The more probable result counts.
+        If the base leaves no force, the second search is enough.
 
         Parameters
         ----------
@@ -397,7 +398,9 @@ class ForceSearch:
         trials = base.ported_trials
         start = replace(start_from_estimate(base), effect=effect_values)
         laws = self.ported.laws(candidate, trials)
-        return self.estimator(trials).estimate_roughly(laws, start, processes)
+        return self.estimator(trials).estimate_roughly(
+            laws, start, processes, has_large_forces=not base.leaves_no_force
+        )
 
     def polish_effects(
         self, base: Estimate, candidate: Candidate, effect_values: FloatArray
