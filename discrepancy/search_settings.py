@@ -123,8 +123,9 @@ class SearchSettings:
     counts as far, too."""
 
     mesh_error: float = 0.005
-    """Relative error of a reading that the mesh of a structure causes, half of that of a
-    frequency."""
+    """Relative error of a reading that the mesh of a structure causes, half of that of a frequency.
+
+    It widens intervals, and a second effect has to explain more than it does."""
 
     # ---------------------------------------------------------------- named by the missing force
     least_low_end: float = 0.25

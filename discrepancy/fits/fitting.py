@@ -26,6 +26,7 @@ from discrepancy.fits.normal_equations import (
     NormalEquations,
     check_finite,
     cholesky_factor,
+    covariance_by_mesh_errors,
     normal_equations,
     solve_factored,
 )
@@ -74,6 +75,9 @@ class CandidateFit(FitState):
         matrix over the readings of the channel.
     converged : bool
         Whether the predicted decrease of the objective fell below `CONVERGED_DECREASE`.
+    mesh_covariance : (E, E) array or None
+        The covariance of the effect parameters by errors of the mesh in the readings; None if the
+        model has no mesh.
     draws : (N, E) array or None
         The posterior draws of the effect parameters, if their posterior is wider than the
         covariance says (see `predictive.with_draws`).
@@ -87,6 +91,7 @@ class CandidateFit(FitState):
     covariance: FloatArray
     absorbed_freedom: FloatArray
     converged: bool = True
+    mesh_covariance: FloatArray | None = None
     draws: FloatArray | None = field(default=None, repr=False)
     residual_process: ResidualProcess | None = field(default=None, repr=False)
 
@@ -102,9 +107,10 @@ class CandidateFit(FitState):
 
     @property
     def effect_covariance(self) -> FloatArray:
-        """The covariance (E, E) of the scaled effect parameters."""
+        """The covariance (E, E) of the scaled effect parameters, by noise and errors of a mesh."""
         first_parameter = len(self.covariance) - self.candidate.parameter_count
-        return self.covariance[first_parameter:, first_parameter:]
+        by_noise = self.covariance[first_parameter:, first_parameter:]
+        return by_noise if self.mesh_covariance is None else by_noise + self.mesh_covariance
 
     @property
     def chi_square(self) -> float:
@@ -478,6 +484,9 @@ def _with_evidence(
         covariance=covariance[:shared_count, :shared_count],
         absorbed_freedom=absorbed_freedom,
         converged=converged,
+        mesh_covariance=covariance_by_mesh_errors(
+            problem, equations, covariance[problem.shared.unknown_count : shared_count]
+        ),
     )
 
 

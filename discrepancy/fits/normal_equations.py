@@ -221,3 +221,26 @@ def normal_equations(
         gradient[unknown_indices] += trial.jacobian @ trial.residual
         trials_with_indices.append((trial, unknown_indices))
     return NormalEquations(trials_with_indices, matrix, gradient)
+
+
+def covariance_by_mesh_errors(
+    problem: Problem, equations: NormalEquations, covariance: FloatArray
+) -> FloatArray | None:
+    """Return the covariance (E, E) of the effect parameters by errors of a mesh in the readings.
+
+    The fit takes these errors for motion of the structure: errors e of the readings move all
+    unknowns by H^-1 J e, with the derivatives J. `covariance` (E, n) has the rows of H^-1 that
+    belong to the effect parameters. The result is None if the model has no mesh.
+    """
+    if not problem.model.nuisance_parameters:
+        return None
+    by_mesh = np.zeros((len(covariance), len(covariance)))
+    for data, (trial_jacobian, unknown_indices) in zip(
+        problem.trials, equations.trials, strict=True
+    ):
+        derivatives = trial_jacobian.jacobian.reshape(-1, *data.weight.shape)  # (M, N, C)
+        for column, errors in enumerate(data.mesh_errors):
+            weighted_errors = trial_jacobian.precision_root[column] * errors
+            moves = covariance[:, unknown_indices] @ (derivatives[:, :, column] @ weighted_errors)
+            by_mesh += moves @ moves.T
+    return by_mesh

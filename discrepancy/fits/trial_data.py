@@ -8,7 +8,7 @@ recorded inputs, and uncertain health (stiffness losses).
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import accumulate
 from math import inf, isinf, prod
@@ -26,6 +26,7 @@ from discrepancy.campaign.records import (
     Trial,
     TrialKind,
 )
+from discrepancy.search_settings import SEARCH
 from discrepancy.system.interface import Model
 from discrepancy.system.response import Conditions
 
@@ -397,6 +398,11 @@ class TrialData:
         1 for a sample that is compared with the model, else 0.
     noise_models : tuple of NoiseModel
         The noise model of each column.
+    mesh_errors : tuple of (N, K) array
+        What the errors of a mesh may add to each column, as K independent courses with the standard
+        deviation one, in units of the noise: `SEARCH.mesh_error` times the readings of each channel
+        of its quantity, since a coarse mesh shifts shapes of modes and displacements. The tuple is
+        empty if the model has no mesh.
     """
 
     trial: Trial
@@ -405,6 +411,7 @@ class TrialData:
     unknowns: LocalUnknowns
     weight: FloatArray
     noise_models: tuple[NoiseModel, ...]
+    mesh_errors: tuple[FloatArray, ...] = ()
 
     @property
     def sample_deviation(self) -> FloatArray:
@@ -460,7 +467,7 @@ class TrialData:
             filter_order = len(noise_models[column].autoregression)
             for unused_row in np.flatnonzero(~trial.used[:, column]):
                 weight[unused_row : unused_row + filter_order + 1, column] = 0.0
-        return cls(
+        data = cls(
             trial=trial,
             deviation=deviation,
             channel_indices=np.array([channel_names.index(name) for name in trial.channels]),
@@ -468,6 +475,22 @@ class TrialData:
             weight=weight,
             noise_models=noise_models,
         )
+        if not model.nuisance_parameters:
+            return data
+        return replace(data, mesh_errors=data._errors_of_mesh(campaign))
+
+    def _errors_of_mesh(self, campaign: Campaign) -> tuple[FloatArray, ...]:
+        """Return the errors (N, K) that a mesh may cause in each column, see `mesh_errors`."""
+        readings = np.where(self.trial.used, self.trial.values, 0.0)
+        quantities = [campaign.channels[name].quantity for name in self.trial.channels]
+        errors = []
+        for number, quantity in enumerate(quantities):
+            is_alike = [other == quantity for other in quantities]
+            # the readings of each such channel in the units of this column: (K, N, C)
+            in_all_columns = np.repeat(readings.T[is_alike, :, None], len(quantities), axis=2)
+            signals = self.standardise(in_all_columns)[..., number].T
+            errors.append(SEARCH.mesh_error * signals)
+        return tuple(errors)
 
 
 def stand_in_deviation(campaign: Campaign, name: str) -> float:

@@ -224,8 +224,10 @@ def _intervals(
         low, high = np.quantile(hypothesis.draws @ functions.T, (0.05, 0.95), axis=0)
         # the most probable value may lie outside of the quantiles, and is included
         return np.minimum(low, most_probable), np.maximum(high, most_probable)
-    first_effect = len(hypothesis.shared)
-    covariance = hypothesis.covariance[first_effect:, first_effect:]
+    if isinstance(hypothesis, CandidateFit):
+        covariance = hypothesis.effect_covariance  # by errors of a mesh, too
+    else:
+        covariance = hypothesis.covariance[len(hypothesis.shared) :, len(hypothesis.shared) :]
     variances = np.sum((functions @ covariance) * functions, axis=1)
     half_width = NINETY_PERCENT_QUANTILE * np.sqrt(variances)
     return most_probable - half_width, most_probable + half_width

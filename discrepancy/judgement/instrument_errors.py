@@ -10,6 +10,7 @@ from discrepancy.fits.fitting import CandidateFit
 from discrepancy.fits.problem import Problem
 from discrepancy.search.strategy import Search
 from discrepancy.search_settings import SEARCH
+from discrepancy.system.structure_unknowns import MESH_DEVIATION
 from discrepancy.verdict import Verdict, VerdictKind
 from fe.runtime.patch import (
     READ_PLACES,
@@ -45,6 +46,14 @@ def has_one_driven_channel(problem: Problem) -> bool:
     return is_driven and len(problem.channel_names) == 1
 
 
+def least_instrument_error(problem: Problem) -> float:
+    """Return the relative error of an instrument below which it is not named.
+
+    On a mesh it is the error of a frequency by the mesh, which shifts phases as a clock does.
+    """
+    return MESH_DEVIATION if problem.model.nuisance_parameters else LEAST_INSTRUMENT_ERROR
+
+
 def is_negligible_instrument_error(
     problem: Problem, patch: ModelPatch, *, least_unstated_gain: float = LEAST_INSTRUMENT_ERROR
 ) -> bool:
@@ -61,9 +70,9 @@ def is_negligible_instrument_error(
         error = _relative_instrument_error(problem, primitive)
         if error is None:
             return False
-        least_named_error = LEAST_INSTRUMENT_ERROR
+        least_named_error = least_instrument_error(problem)
         if isinstance(primitive, SensorGain) and _has_exact_gain(problem, primitive):
-            least_named_error = least_unstated_gain
+            least_named_error = max(least_unstated_gain, least_named_error)
         ratios.append(error / least_named_error)
     # an empty change is not an error of instruments
     return max(ratios, default=1.0) < 1.0
@@ -108,8 +117,8 @@ def verdict_rejecting_instruments(
     if all(is_negligible_instrument_error(problem, effect.patch) for effect in verdict.effects):
         sentence = (
             f"The model explains the data except for {causes} below "
-            f"{100.0 * LEAST_INSTRUMENT_ERROR:g} % of the quantity; an error that small counts as "
-            "a nuisance of the instruments, and is not named."
+            f"{100.0 * least_instrument_error(problem):g} % of the quantity; an error that small "
+            "counts as a nuisance of the instruments or the mesh, and is not named."
         )
         return replace(without_name, kind=VerdictKind.NOTHING_MISSING, sentence=sentence)
     # reason 2: a gain that only keeps calibrated parameters within their priors

@@ -77,11 +77,10 @@ def test_different_changes_of_a_mesh_are_tried_together(beam_model, monkeypatch)
     for effect in search.effects:
         candidate = Candidate((EffectTerm(effect, effect.places(problem.setting)[0]),))
         start = replace(no_effect.point, effect=candidate.start_values())
-        search.record_fit(fit(problem, candidate, start, iterations=0), exact=False)
+        search.record_fit(fit(problem, candidate, start, iterations=4), exact=False)
     search.fit_effects_at_several_places()
     added = {base.candidate.identifiers: {effect.identifier for effect in added} for base, added in tried}
-    changes = {"added_mass", "region_stiffness_loss"}
-    assert added[("added_mass",)] == added[("region_stiffness_loss",)] == changes
+    assert added[("added_mass",)] == {"added_mass", "region_stiffness_loss"}
     assert added.get(("gauge_gain",), {"gauge_gain"}) == {"gauge_gain"}
 
 
