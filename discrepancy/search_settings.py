@@ -67,12 +67,14 @@ class SearchSettings:
     and the right one is narrow."""
     coarse_level_step: int = 5
     """Step between the levels of that grid that are tried first at each of many places."""
-    places_with_all_levels: int = 10
-    """Number of places, the best at these levels, at which the levels between are tried, too."""
+    places_with_near_levels: int = 10
+    """Number of places, the best at these levels, at which the levels next to the best of them are
+    tried, too."""
     first_periods: float = 4.0
     """Number of periods of the first mode in which the best of many places are chosen."""
     places_far_from_data: int = 3
-    """Number of these best places, at which all levels are then tried."""
+    """Number of these best places, at which fits begin; without errors of a mesh, all levels are
+    tried there first."""
     small_remainder: float = 0.05
     """Fraction of the squared residuals of the model without effect. If a set with an effect that
     may act at several places leaves less, no further places are tried beside it."""

@@ -62,9 +62,10 @@ def missing_port_remark(setting: Setting, effects: Sequence[Effect]) -> list[str
 
 
 def left_out_modes_remark(problem: Problem) -> str | None:
-    """Return the remark that records show higher modes than a reduced model has; None otherwise.
+    """Return the remark that records may show higher modes than a reduced model has; else None.
 
-    Motion in modes that are left out follows the loads at once, where the structure rings.
+    A reduced model lets the modes that it leaves out follow the loads at once; in the structure
+    they ring. The frequencies are those at the prior means of the parameters.
     """
     model = problem.model
     intervals = [data.trial.interval for data in problem.trials if data.trial.is_dynamic]
@@ -72,12 +73,12 @@ def left_out_modes_remark(problem: Problem) -> str | None:
         return None
     state = SystemState(tuple(model.prior_mean().tolist()))
     frequencies = model.build_system(state).angular_frequency / (2.0 * pi)
-    shown_frequency = 0.5 / min(intervals)
-    if shown_frequency <= frequencies.max():
+    sampled_frequency = 0.5 / min(intervals)
+    if sampled_frequency <= frequencies.max():
         return None
     return (
         f"The reduced model has {len(frequencies)} modes up to {frequencies.max():.4g} Hz, and the "
-        f"records show frequencies up to {shown_frequency:.4g} Hz: if higher modes ring in them, "
+        f"records are sampled for up to {sampled_frequency:.4g} Hz: if higher modes ring in them, "
         "state more modes in [reduction] of the structure file."
     )
 

@@ -506,7 +506,7 @@ def _effect_draws(fit: CandidateFit, seed: int, count: int) -> FloatArray:
     # Gaussian approximation, by the Cholesky factor of the covariance (E, E). The diagonal is
     # raised slightly, because the matrix may be singular to rounding.
     size = fit.candidate.parameter_count
-    covariance = fit.effect_covariance + 1e-15 * np.eye(size)
+    covariance = fit.whole_effect_covariance + 1e-15 * np.eye(size)
     cholesky_factor = np.linalg.cholesky(covariance)
     standard_normal = generator.standard_normal((count, size))
     return np.asarray(fit.point.effect + standard_normal @ cholesky_factor.T)

@@ -13,7 +13,6 @@ from reporting import terminal
 from reporting.errors import InvalidChoiceError, ReportingError
 from reporting.files import NO_SPACE
 from reporting.formats.former_options import former_names_as_lines
-from reporting.json_file import read_json
 from reporting.terminal import JsonOption, NoReportOption
 from reporting.words import number
 from twin_master.command_options import (
@@ -301,6 +300,7 @@ def _fly_and_print_mission(
     with view_beside(view) as begun, terminal.interruptible(explain_interruption):
         outcome = fly_mission(progress=terminal.progress(), report=report, begun=begun)
         if json:
+            from reporting.json_file import read_json
             from twin_master.store.writing import SUMMARY_NAME
 
             # The summary, with the paths of run and report.

@@ -146,8 +146,9 @@ class MotionEstimator:
     ) -> Estimate | None:
         """Return an estimate for a first comparison, after few steps.
 
-        One estimate is made with the small missing forces that may remain beside the effects, and
-        others with those of `start`, which are lowered in steps if they are large.
+        One estimate is made with the small missing forces that may remain beside the effects. If a
+        force is missing without the last effect, or if this estimate fails, others are made with
+        the missing forces of `start`, which are lowered in steps.
 
         Parameters
         ----------

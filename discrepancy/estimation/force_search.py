@@ -379,7 +379,7 @@ class ForceSearch:
 
         Two searches begin at the motion of `base`: one with its missing forces, which are lowered
         step by step, the other with `processes`, which are small. The more probable result counts.
-        If the base leaves no force, the second search is enough.
+        If the base leaves no force, the second search is enough, unless it fails.
 
         Parameters
         ----------

@@ -68,16 +68,16 @@ class CandidateFit(FitState):
         The Laplace approximation of the log evidence, up to the same constant as the objective
         [nat].
     covariance : (Q + E, Q + E) array
-        The posterior covariance of the shared unknowns and effect parameters (scaled), with the
-        unknowns of the trials marginalised.
+        The posterior covariance of the shared unknowns and effect parameters (scaled) by noise
+        alone, with the unknowns of the trials marginalised.
     absorbed_freedom : (channels,) array
         The degrees of freedom that the fitted unknowns absorb in each channel: the trace of the hat
         matrix over the readings of the channel.
     converged : bool
         Whether the predicted decrease of the objective fell below `CONVERGED_DECREASE`.
     mesh_covariance : (E, E) array or None
-        The covariance of the effect parameters by errors of the mesh in the readings; None if the
-        model has no mesh.
+        The covariance of the effect parameters by errors of a mesh in the readings; None if no
+        errors of a mesh are fitted.
     draws : (N, E) array or None
         The posterior draws of the effect parameters, if their posterior is wider than the
         covariance says (see `predictive.with_draws`).
@@ -107,10 +107,15 @@ class CandidateFit(FitState):
 
     @property
     def effect_covariance(self) -> FloatArray:
-        """The covariance (E, E) of the scaled effect parameters, by noise and errors of a mesh."""
+        """The covariance (E, E) of the scaled effect parameters, by noise alone."""
         first_parameter = len(self.covariance) - self.candidate.parameter_count
-        by_noise = self.covariance[first_parameter:, first_parameter:]
-        return by_noise if self.mesh_covariance is None else by_noise + self.mesh_covariance
+        return self.covariance[first_parameter:, first_parameter:]
+
+    @property
+    def whole_effect_covariance(self) -> FloatArray:
+        """The covariance (E, E) of the scaled effect parameters, by noise and errors of a mesh."""
+        by_mesh = 0.0 if self.mesh_covariance is None else self.mesh_covariance
+        return np.asarray(self.effect_covariance + by_mesh)
 
     @property
     def chi_square(self) -> float:

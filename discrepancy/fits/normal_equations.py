@@ -228,9 +228,10 @@ def covariance_by_mesh_errors(
 ) -> FloatArray | None:
     """Return the covariance (E, E) of the effect parameters by errors of a mesh in the readings.
 
-    The fit takes these errors for motion of the structure: errors e of the readings move all
-    unknowns by H^-1 J e, with the derivatives J. `covariance` (E, n) has the rows of H^-1 that
-    belong to the effect parameters. The result is None if the model has no mesh.
+    The fit attributes these errors to its unknowns: errors e of the readings move all unknowns by
+    H^-1 J e, with the derivatives J. Errors of different trials and channels are taken as
+    independent. `covariance` (E, n) has the rows of H^-1 that belong to the effect parameters. The
+    result is None if no errors of a mesh are fitted.
     """
     if not problem.model.nuisance_parameters:
         return None

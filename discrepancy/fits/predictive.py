@@ -326,7 +326,7 @@ def with_draws(problem: Problem, fit: CandidateFit) -> CandidateFit:
     CandidateFit
         The given fit if -ln posterior rises by more than `LEAST_MISFIT_RISE` at both ends of the
         Gaussian 90 % interval along every principal axis of the covariance; otherwise the fit with
-        `draws`. The same fit always gives the same draws.
+        `draws`, which errors of a mesh move, too. The same fit always gives the same draws.
     """
     if not fit.candidate.parameter_count:
         return fit
@@ -351,7 +351,12 @@ def with_draws(problem: Problem, fit: CandidateFit) -> CandidateFit:
         energy_rises.append(energy(fitted_effect + NINETY_PERCENT_QUANTILE * axis))
     if min(energy_rises) > LEAST_MISFIT_RISE:
         return fit
-    return replace(fit, draws=importance_draws(energy, fitted_effect, axes))
+    draws = importance_draws(energy, fitted_effect, axes)
+    if fit.mesh_covariance is not None:
+        generator = np.random.default_rng(SEED)
+        no_move = np.zeros(len(fitted_effect))
+        draws += generator.multivariate_normal(no_move, fit.mesh_covariance, size=len(draws))
+    return replace(fit, draws=draws)
 
 
 def importance_draws(

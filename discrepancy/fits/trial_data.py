@@ -402,7 +402,7 @@ class TrialData:
         What the errors of a mesh may add to each column, as K independent courses with the standard
         deviation one, in units of the noise: `SEARCH.mesh_error` times the readings of each channel
         of its quantity, since a coarse mesh shifts shapes of modes and displacements. The tuple is
-        empty if the model has no mesh.
+        empty if no errors of a mesh are fitted.
     """
 
     trial: Trial

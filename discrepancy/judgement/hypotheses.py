@@ -225,7 +225,7 @@ def _intervals(
         # the most probable value may lie outside of the quantiles, and is included
         return np.minimum(low, most_probable), np.maximum(high, most_probable)
     if isinstance(hypothesis, CandidateFit):
-        covariance = hypothesis.effect_covariance  # by errors of a mesh, too
+        covariance = hypothesis.whole_effect_covariance
     else:
         covariance = hypothesis.covariance[len(hypothesis.shared) :, len(hypothesis.shared) :]
     variances = np.sum((functions @ covariance) * functions, axis=1)

@@ -30,7 +30,7 @@ INSTRUMENT_PRIMITIVES = (LoadGain, *READ_PLACES, *SENSORS)
 
 LEAST_INSTRUMENT_ERROR = 1e-3
 """Relative gain, tare or clock error below which it is not named, as any instrument has errors like
-that."""
+that; on a mesh, see `_least_named_error`."""
 LEAST_UNSTATED_GAIN = 1e-2
 """The same for the gain of a channel without a stated deviation, if laws alone explain as much. A
 gain is never exact, even if the campaign states no deviation."""
@@ -46,12 +46,15 @@ def has_one_driven_channel(problem: Problem) -> bool:
     return is_driven and len(problem.channel_names) == 1
 
 
-def least_instrument_error(problem: Problem) -> float:
+def _least_named_error(problem: Problem, primitive: Primitive) -> float:
     """Return the relative error of an instrument below which it is not named.
 
-    On a mesh it is the error of a frequency by the mesh, which shifts phases as a clock does.
+    On a mesh it is larger: an error of a frequency by the mesh shifts phases as a clock does, and
+    the mesh causes errors of readings as a gain does.
     """
-    return MESH_DEVIATION if problem.model.nuisance_parameters else LEAST_INSTRUMENT_ERROR
+    if not problem.model.nuisance_parameters:
+        return LEAST_INSTRUMENT_ERROR
+    return MESH_DEVIATION if isinstance(primitive, Clock) else SEARCH.mesh_error
 
 
 def is_negligible_instrument_error(
@@ -70,7 +73,7 @@ def is_negligible_instrument_error(
         error = _relative_instrument_error(problem, primitive)
         if error is None:
             return False
-        least_named_error = least_instrument_error(problem)
+        least_named_error = _least_named_error(problem, primitive)
         if isinstance(primitive, SensorGain) and _has_exact_gain(problem, primitive):
             least_named_error = max(least_unstated_gain, least_named_error)
         ratios.append(error / least_named_error)
@@ -102,7 +105,8 @@ def verdict_rejecting_instruments(
 ) -> Verdict | None:
     """Return the verdict that rejects named errors of instruments; None if they may be the cause.
 
-    There are two reasons to reject them. The errors may be so small that any instrument has them.
+    There are two reasons to reject them. The errors may be so small that any instrument has them,
+    or that a mesh causes as much.
     Or they may only serve to keep calibrated parameters within their priors: with one channel and a
     recorded drive, a gain has the same effect as all parameters of a linear model together. If the
     model without effect predicts held-out trials, nothing but these priors supports the gain.
@@ -113,12 +117,17 @@ def verdict_rejecting_instruments(
     search = comparison.search
     without_name = replace(verdict, effects=(), group=())
     causes = " or ".join(dict.fromkeys(effect.name for effect in verdict.effects))
-    # reason 1: errors that any instrument has
+    # reason 1: errors that any instrument has, or that a mesh causes
     if all(is_negligible_instrument_error(problem, effect.patch) for effect in verdict.effects):
+        limit = max(
+            _least_named_error(problem, primitive)
+            for effect in verdict.effects
+            for primitive in effect.patch
+        )
+        source = "the mesh" if problem.model.nuisance_parameters else "the instruments"
         sentence = (
-            f"The model explains the data except for {causes} below "
-            f"{100.0 * least_instrument_error(problem):g} % of the quantity; an error that small "
-            "counts as a nuisance of the instruments or the mesh, and is not named."
+            f"The model explains the data except for {causes} below {100.0 * limit:g} % of the "
+            f"quantity; an error that small counts as a nuisance of {source}, and is not named."
         )
         return replace(without_name, kind=VerdictKind.NOTHING_MISSING, sentence=sentence)
     # reason 2: a gain that only keeps calibrated parameters within their priors

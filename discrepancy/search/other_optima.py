@@ -78,7 +78,7 @@ def refit_masses_from_nearest_points(
     A mass lies beside a point of the grid, within the reach of this point. A fit that begins beside
     a wrong point ends at the edge of its reach, and the mass, which should be farther away, gets a
     wrong size there. So a mass that has come nearer to another point is fitted beside that one,
-    until no evidence is gained.
+    until the best set stays.
 
     Parameters
     ----------
@@ -100,7 +100,8 @@ def refit_masses_from_nearest_points(
             moved[number] = (moved_term, np.where(is_magnitude, values, moved_term.start_values()))
             terms, effect_values = zip(*moved, strict=True)
             candidate = Candidate(terms)
-            if candidate.key in candidates.exact_fits:
+            has_term_twice = len(set(candidate.key)) < len(terms)
+            if has_term_twice or candidate.key in candidates.exact_fits:
                 continue
             on_progress(f"fitting {candidate.description} at {place}")
             start = replace(best_fit.point, effect=np.concatenate(effect_values))

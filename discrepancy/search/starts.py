@@ -323,7 +323,7 @@ def _best_places(
 
     Each place is searched on its own, since the magnitude that gives the measured first frequency
     differs between places. Every `SEARCH.coarse_level_step`-th of the levels (L,) is tried first,
-    then, at the best `SEARCH.places_with_all_levels` places, the levels next to the best of them.
+    then, at the best `SEARCH.places_with_near_levels` places, the levels next to the best of them.
     Objectives are compared to two digits; places that are then equal stay in their given order, in
     which named sets of nodes come first. Where errors of a mesh are fitted, the points are fitted
     to the first periods: in the whole record, phases drift too far for a fit to begin at a grid.
@@ -342,8 +342,10 @@ def _best_places(
     coarse_levels = levels[half_step :: SEARCH.coarse_level_step]
     points_of_places = [points_at(place, coarse_levels) for place in places]
     coarse_points = [points[0] for points in points_of_places if points]
+    if not coarse_points:  # the effect is larger than the model allows at all places
+        return []
     objectives = sorted(point.objective for point in coarse_points)
-    largest_objective = objectives[: SEARCH.places_with_all_levels][-1]
+    largest_objective = objectives[: SEARCH.places_with_near_levels][-1]
     best_of_places = []
     for coarse_point in coarse_points:
         if coarse_point.objective > largest_objective:
@@ -369,7 +371,7 @@ def _best_places(
         if early_fit is not None:
             start = best_point.start._replace(point=early_fit.point)
             points.append(_GridPoint(early_fit.objective, best_point.place, start))
-    return points
+    return sorted(points, key=lambda point: point.objective)
 
 
 def _problem_of_first_periods(problem: Problem) -> Problem:

@@ -337,8 +337,8 @@ class Search(FittedCandidates):
     def search_sets(self) -> None:
         """Fit laws of free shape, then sets of several effects, and improve the best set.
 
-        Effects are added unless a law of free shape is the best fit. Pairs are fitted only if the
-        best set still leaves more than noise.
+        Effects are added unless a law of free shape is the best fit. Further places of each effect
+        and pairs are fitted only if the best set still leaves more than noise.
         """
         self.fit_free_shapes()
         self.refine_time_steps()
@@ -420,8 +420,8 @@ class Search(FittedCandidates):
         sensors may then explain more, and `add_effects`, which begins with the best fit, would not
         reach it. So places are added to each such effect on its own, as long as the score rises.
         On a mesh the same holds for two different effects that change mass or stiffness, such as a
-        mass and a yielding support: each of them is added to each other one, until a set explains
-        the data.
+        mass and a yielding support: each of them that alone is more probable than no effect gets
+        each other one added, until a set explains the data.
         """
         several_places = [effect for effect in self.effects if effect.at_several_places]
         mesh_changes: list[Effect] = []
@@ -431,8 +431,6 @@ class Search(FittedCandidates):
                 effect for effect in several_places if moves_frequencies(effect, setting)
             ]
         for effect in several_places:
-            if mesh_changes and not self.is_unexplained():
-                break
             added_effects = mesh_changes if effect in mesh_changes else [effect]
             single_fits = [
                 fit
@@ -445,6 +443,8 @@ class Search(FittedCandidates):
             ):
                 continue
             while len(current_fit.candidate.terms) < SEARCH.largest_set:
+                if mesh_changes and not self.is_unexplained():
+                    break
                 current_score = self.score(current_fit)
                 rough_fits = self.fit_one_more_effect(current_fit, added_effects)
                 score_limit = current_score - SEARCH.largest_longer_set_deficit

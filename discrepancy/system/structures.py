@@ -214,8 +214,8 @@ class StructureModel(SystemModel):
     def prior_moments(self, campaign: Campaign) -> list[tuple[float, float]]:
         """Return mean and standard deviation of the prior of each parameter.
 
-        Without a trial in motion no reading shows errors of the mesh, whose deviations are zero
-        then.
+        Without a trial in motion no reading shows errors of frequencies by the mesh, whose
+        deviations are zero then.
         """
         moments = super().prior_moments(campaign)
         if any(trial.is_dynamic for trial in campaign.trials):
@@ -254,9 +254,10 @@ class StructureModel(SystemModel):
         return self.model.changes_of(state.structure).numbers
 
     def _kinds_with_weight(self, model: ChangeableModel) -> frozenset[TrialKind]:
-        """Return the kinds of static trials in which added masses have weight.
+        """Return the kinds of trials at rest in which added masses have weight.
 
-        A load factor gives it in flights, a constant acceleration in load steps, too.
+        A load factor gives it in flights, a constant acceleration in load steps, too. Controls that
+        no trial records are nominal.
         """
         state = SystemState(tuple(self.prior_mean().tolist()))
         recorded = dict.fromkeys((*self.forces, LOAD_FACTOR), 0.0)
@@ -267,7 +268,7 @@ class StructureModel(SystemModel):
         ):
             in_model = {name: value for name, value in controls.items() if name in model.controls}
             coefficients = model.load_coefficients(self._input_vector(state, in_model))
-            if (coefficients @ model.load_accelerations).any():
+            if model.load_accelerations[coefficients != 0.0].any():
                 kinds.add(kind)
         return frozenset(kinds)
 

@@ -81,8 +81,9 @@ under a load or in a mode."""
 def with_changes(yielding: AffineStructure, reduction: Reduction) -> ChangeableModel:
     """Extend a reduced model by the columns that changes of the structure need.
 
-    The columns of a change are refined until its largest error is below `LARGEST_ERROR`, at most
-    `MOST_REFINEMENTS` times.
+    The columns of all changes are refined once, and those of changes whose largest error exceeds
+    `LARGEST_ERROR` again, at most `MOST_REFINEMENTS` times in all. `change_errors` of the model has
+    the errors that are left.
 
     Parameters
     ----------
@@ -104,15 +105,15 @@ def with_changes(yielding: AffineStructure, reduction: Reduction) -> ChangeableM
     for patch in columns.loss_places:
         columns.add_loss(patch)
     model = columns.model()
-    coarse = list(range(len(model.change_errors)))
-    errors = np.full(len(coarse), np.inf)
+    errors = np.full(len(model.change_errors), np.inf)
+    inexact = list(range(len(errors)))
     for _ in range(MOST_REFINEMENTS):
-        for number in coarse:
+        for number in inexact:
             columns.refine(model, number)
         model = columns.model()
-        errors[coarse] = [columns.error(model, number) for number in coarse]
-        coarse = np.flatnonzero(errors > LARGEST_ERROR).tolist()
-        if not coarse:
+        errors[inexact] = [columns.error(model, number) for number in inexact]
+        inexact = np.flatnonzero(~(errors <= LARGEST_ERROR)).tolist()
+        if not inexact:
             break
     values = {field.name: getattr(model, field.name) for field in fields(ChangeableModel)}
     return ChangeableModel(**values | {"change_errors": errors})

@@ -36,10 +36,8 @@ def test_the_covariance_is_that_of_least_squares_with_correlated_readings(proble
                 move = by_noise[:, indices] @ trial.jacobian @ readings.ravel()
                 expected += np.outer(move, move)
     of_effect = slice(problem.shared.unknown_count, len(fitted.covariance))
-    np.testing.assert_allclose(fitted.effect_covariance, expected[of_effect, of_effect], rtol=1e-6)
-    np.testing.assert_allclose(
-        fitted.covariance[of_effect, of_effect], by_noise[of_effect, of_effect], rtol=1e-6
-    )
+    np.testing.assert_allclose(fitted.whole_effect_covariance, expected[of_effect, of_effect], rtol=1e-6)
+    np.testing.assert_allclose(fitted.effect_covariance, by_noise[of_effect, of_effect], rtol=1e-6)
 
 
 def test_errors_are_a_fraction_of_the_readings_of_each_channel_of_the_quantity(problem):
@@ -51,6 +49,14 @@ def test_errors_are_a_fraction_of_the_readings_of_each_channel_of_the_quantity(p
             own = [other for other, quantity in enumerate(quantities) if quantity == quantities[number]]
             of_itself = errors[:, own.index(number)]
             np.testing.assert_allclose(of_itself, SEARCH.mesh_error * standardised[:, number])
+
+
+def test_errors_do_not_grow_with_a_wider_noise(problem):
+    wide = problem.with_wider_noise(np.full(len(problem.channel_names), 3.0))
+    for data, wide_data in zip(problem.trials, wide.trials, strict=True):
+        for column, errors in enumerate(data.mesh_errors):
+            in_channel_units = wide_data.mesh_errors[column] * wide_data.deviation[column]
+            np.testing.assert_allclose(in_channel_units, errors * data.deviation[column])
 
 
 def test_models_without_a_mesh_have_none():
