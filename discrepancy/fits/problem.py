@@ -529,17 +529,12 @@ class Problem:
         for data in self.trials:
             is_wider = is_unrecorded[data.channel_indices] | data.trial.is_dynamic
             factor = np.where(is_wider, factors[data.channel_indices], 1.0)
-            wider_trials.append(
-                replace(
-                    data,
-                    deviation=data.deviation * factor,
-                    # in units of the noise
-                    mesh_errors=tuple(
-                        errors / own_factor
-                        for errors, own_factor in zip(data.mesh_errors, factor, strict=False)
-                    ),
-                )
+            # errors of a mesh stay the same, and are in units of the noise
+            mesh_errors = tuple(
+                errors / factor[column] for column, errors in enumerate(data.mesh_errors)
             )
+            deviation = data.deviation * factor
+            wider_trials.append(replace(data, deviation=deviation, mesh_errors=mesh_errors))
         wide_problem.trials = tuple(wider_trials)
         wide_problem.record_freedom = np.where(factors != 1.0, inf, self.record_freedom)
         return wide_problem

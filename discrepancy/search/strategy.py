@@ -423,27 +423,26 @@ class Search(FittedCandidates):
         mass and a yielding support: each of them that alone is more probable than no effect gets
         each other one added, until a set explains the data.
         """
+        setting = self.problem.setting
+        on_mesh = bool(self.problem.model.nuisance_parameters)
         several_places = [effect for effect in self.effects if effect.at_several_places]
-        mesh_changes: list[Effect] = []
-        if self.problem.model.nuisance_parameters:
-            setting = self.problem.setting
-            mesh_changes = [
-                effect for effect in several_places if moves_frequencies(effect, setting)
-            ]
+        changes_of_mesh = [
+            effect for effect in several_places if on_mesh and moves_frequencies(effect, setting)
+        ]
         for effect in several_places:
-            added_effects = mesh_changes if effect in mesh_changes else [effect]
+            added_effects = changes_of_mesh if effect in changes_of_mesh else [effect]
             single_fits = [
                 fit
                 for fit in (*self.exact_fits.values(), *self.rough_fits.values())
                 if [term.effect.identifier for term in fit.candidate.terms] == [effect.identifier]
             ]
-            current_fit = max(single_fits, key=self.score, default=self.no_effect)
-            if not current_fit.candidate.terms or (
-                mesh_changes and self.score(current_fit) < self.score(self.no_effect)
-            ):
+            if not single_fits:
+                continue
+            current_fit = max(single_fits, key=self.score)
+            if on_mesh and self.score(current_fit) < self.score(self.no_effect):
                 continue
             while len(current_fit.candidate.terms) < SEARCH.largest_set:
-                if mesh_changes and not self.is_unexplained():
+                if on_mesh and not self.is_unexplained():
                     break
                 current_score = self.score(current_fit)
                 rough_fits = self.fit_one_more_effect(current_fit, added_effects)
