@@ -333,6 +333,7 @@ def _scenario_and_ssp(
 
 def print_outcome(outcome: "RunOutcome") -> None:
     """Print what the twin did, the figures of a run beside their references, and its files."""
+    from twin_master.mission.decision_record import with_folder
     from twin_master.store.writing import printed_values
 
     terminal.say(f"The twin {outcome.control}.", bold=True)
@@ -342,7 +343,7 @@ def print_outcome(outcome: "RunOutcome") -> None:
             f"twin believes the {outcome.origin.model}."
         )
     for notice in outcome.notices:
-        terminal.say(notice.replace(" DIR", f" {outcome.folder}"), fg="yellow")
+        terminal.say(with_folder(notice, outcome.folder), fg="yellow")
     numbers_of_sources: dict[str, int] = {}  # of the references, from 1
     rows = []
     texts = printed_values(outcome.figures)

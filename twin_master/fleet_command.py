@@ -48,8 +48,8 @@ if TYPE_CHECKING:
     from twin_master.watch.metrics import MetricsServer
 
 
-Standing = Mapping[str, Any]
-"""The state of each asset of a watched fleet, as `FleetWatch.standing` returns it."""
+WatchedState = Mapping[str, Any]
+"""The state of each asset of a watched fleet, as `FleetWatch.state` returns it."""
 ROWS = 20
 """The number of assets in the table on the console, the worst first."""
 MOST_ENDINGS = 10
@@ -109,7 +109,7 @@ def watch(
     watched = FleetWatch(
         fleet,
         folder,
-        console.tell,
+        console.print_decision,
         console.say,
         follow=follow,
         steps=steps,
@@ -119,17 +119,17 @@ def watch(
     try:
         with (
             serve_metrics(metrics) as console.metrics_server,
-            call_on_end_signal(watched.ask),
+            call_on_end_signal(watched.request_end),
             view_beside(view, server) as begun,
             console.live_display,
         ):
             begun(folder)
             console.say_address_of_metrics()
-            watched.run(lambda: console.refresh(watched.standing))
+            watched.run(lambda: console.refresh(watched.state))
     except Exception as error:
         error.add_note("What was observed is kept: repeat the command to go on.")
         raise
-    console.say(f"{_heading(watched.standing)}: {folder}.")
+    console.say(f"{_heading(watched.state)}: {folder}.")
     for name, complaint in watched.complaints.items():
         console.say(f"{name}: {complaint}")
     if watched.failures or watched.complaints:
@@ -158,20 +158,21 @@ class _Console:
 
         self._is_for_people = sys.stdout.isatty()
         self._live = Live(console=Console(), auto_refresh=False, transient=False)
-        self._last_standing: Standing = {}
+        self._last_state: WatchedState = {}
         self.live_display: AbstractContextManager[object] = nullcontext()
         if self._is_for_people and not terminal.loudness.quiet:
             self.live_display = self._live
 
-    def tell(self, asset: "WatchedAsset", decision: Mapping[str, Any]) -> None:
+    def print_decision(self, asset: "WatchedAsset", decision: Mapping[str, Any]) -> None:
         """Print the new notices of a decision and, for a program, the decision."""
+        from twin_master.mission.decision_record import with_folder
+
         if self.metrics_server is not None:
             self.metrics_server.attach(asset.name, asset.watch).note_decision(decision)
         for notice in decision["notices"]:
-            was_told = notice["sentence"] in asset.alarms
-            if not was_told:
-                sentence = notice["sentence"].replace(" DIR", f" {asset.watch.folder}")
-                self.say(f"{asset.name}: {sentence}")
+            is_printed = notice["sentence"] in asset.alarms
+            if not is_printed:
+                self.say(f"{asset.name}: {with_folder(notice['sentence'], asset.watch.folder)}")
         if self._is_for_people or terminal.loudness.quiet:
             return
         try:
@@ -191,16 +192,16 @@ class _Console:
         else:
             typer.echo(text, err=True)
 
-    def refresh(self, standing: Standing) -> None:
+    def refresh(self, state: WatchedState) -> None:
         """Show the table if it has changed; for a program, flush the printed decisions."""
         if not self._is_for_people:
             sys.stdout.flush()
-        elif standing is not self._last_standing:
-            self._last_standing = standing
-            self._live.update(_table_of_worst_assets(standing), refresh=True)
+        elif state is not self._last_state:
+            self._last_state = state
+            self._live.update(_table_of_worst_assets(state), refresh=True)
 
 
-def _heading(standing: Standing) -> str:
+def _heading(state: WatchedState) -> str:
     """Return the heading of the table of watched assets, such as "3 assets, 120 steps, 1 alarm".
 
     The numbers of refused messages and of assets that could not be watched are added if there are
@@ -208,7 +209,7 @@ def _heading(standing: Standing) -> str:
     """
     from twin_master.fleet.watched.watched_asset import watched_fleet_counts
 
-    counts = watched_fleet_counts(standing)
+    counts = watched_fleet_counts(state)
     phrases = [
         counted(counts["assets"], "asset"),
         counted(counts["steps"], "step"),
@@ -221,12 +222,12 @@ def _heading(standing: Standing) -> str:
     return ", ".join(phrases)
 
 
-def _table_of_worst_assets(standing: Standing) -> "Table":
+def _table_of_worst_assets(state: WatchedState) -> "Table":
     """Return the table of watched assets, those with most alarms and most severe damage first."""
     from twin_master.mission.decision_record import health_in_words
 
     assets = {}
-    for name, asset in standing["assets"].items():
+    for name, asset in state["assets"].items():
         if asset["last"] is not None:  # it has had a step
             assets[name] = asset
 
@@ -249,7 +250,7 @@ def _table_of_worst_assets(standing: Standing) -> "Table":
         rows.append(row)
     headings = ["asset", "step", "control", *states, "next", "alarms"]
     table = terminal.console_table(headings, rows, terminal.console().width)
-    table.title = _heading(standing)
+    table.title = _heading(state)
     return table
 
 
@@ -370,8 +371,8 @@ def fly_and_print_fleet(
         Whether to print JSON.
     """
     from twin_master.fleet.comparison import statistics_of_fleets
-    from twin_master.fleet.configuration import REPORT_NAME
     from twin_master.fleet.flight import fly_fleet
+    from twin_master.run_folder import REPORT_NAME
 
     folder = out if out is not None else Path("runs") / fleet.head.name
     hint = f"what was flown is kept in {folder}: repeat the command to go on"

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Protocol, cast
 
 import numpy as np
 
+from reporting.arrays import Float
 from reporting.pages.notebook import new_panels
 from twin_master.scenario.section import printed_state
 
@@ -138,8 +139,6 @@ def plot_courses(fleet: "xr.DataTree", axes: "Axes | Sequence[Axes] | None" = No
     list of Axes
         The panels.
     """
-    from reporting.pages import figures as style
-
     rows = []
     for group_name, group in fleet.children.items():
         for factor in group["filtered"].to_dataset()["region"].values:
@@ -150,21 +149,40 @@ def plot_courses(fleet: "xr.DataTree", axes: "Axes | Sequence[Axes] | None" = No
         stored_unit = str(group["filtered"].to_dataset()["mean"].attrs["units"])
         has_one_unit = ", " not in stored_unit  # factors may differ in their unit
         scale, unit = printed_state(stored_unit) if has_one_unit else (1.0, "SI")
-        believed_states = scale * group["filtered"].to_dataset()["mean"].sel(region=factor).values
-        truth = scale * group["truth"].to_dataset()["state"].sel(region=factor).values
-        steps = np.flatnonzero(~np.isnan(believed_states).all(axis=0))
-        quantiles = np.nanquantile(believed_states[:, steps], [0.05, 0.25, 0.5, 0.75, 0.95], axis=0)
-        style.band(panel, steps, quantiles[0], quantiles[4], style.PRESENT)
-        style.band(panel, steps, quantiles[1], quantiles[3], style.PRESENT)
-        panel.plot(steps, quantiles[2], color=style.PRESENT, label="believed, median of the twins")
-        known_steps = np.flatnonzero(~np.isnan(truth).all(axis=0))
-        true_median = np.nanmedian(truth[:, known_steps], axis=0)
-        panel.plot(known_steps, true_median, **style.TRUTH_LINE, label="truth, median of the twins")
+        believed_states = group["filtered"].to_dataset()["mean"].sel(region=factor).values
+        true_states = group["truth"].to_dataset()["state"].sel(region=factor).values
+        draw_states_of_twins(panel, scale * believed_states, scale * true_states)
         panel.set_ylabel(f"{factor}, {unit}")
         panel.set_title(group_name, loc="left")
         panel.set_xlabel(group.attrs["step_name"])
     panels[0].legend(frameon=False)
     return panels
+
+
+def draw_states_of_twins(axes: "Axes", believed: Float, truth: Float) -> None:
+    """Draw one factor of the states of B twins over T steps.
+
+    Bands hold 50 % and 90 % of the believed states; lines are the medians of the believed and of
+    the true states.
+
+    Parameters
+    ----------
+    believed : (B, T) array
+        The mean states; NaN in steps that were not flown.
+    truth : (B, T) array
+        The true states; NaN where they are not known.
+    """
+    from reporting.pages import figures as style
+
+    steps = np.flatnonzero(~np.isnan(believed).all(axis=0))
+    quantiles = np.nanquantile(believed[:, steps], [0.05, 0.25, 0.5, 0.75, 0.95], axis=0)
+    low, lower_quartile, medians, upper_quartile, high = quantiles
+    style.band(axes, steps, low, high, style.PRESENT)
+    style.band(axes, steps, lower_quartile, upper_quartile, style.PRESENT)
+    axes.plot(steps, medians, color=style.PRESENT, label="believed, median of the twins")
+    known_steps = np.flatnonzero(~np.isnan(truth).all(axis=0))
+    true_medians = np.nanmedian(truth[:, known_steps], axis=0)
+    axes.plot(known_steps, true_medians, **style.TRUTH_LINE, label="truth, median of the twins")
 
 
 def _tree_of(run: "xr.DataTree | HasTree") -> "xr.DataTree":

@@ -2,7 +2,6 @@
 
 import json
 import os
-import shlex
 import signal
 import sys
 import time
@@ -239,7 +238,7 @@ def _decision_printer(
 
 def _print_end_of_watch(folder: Path, watched: "Watch", *, report: bool) -> None:
     """Flush the decisions; print the number of messages, and the paths of folder and report."""
-    from twin_master.store.writing import REPORT_NAME
+    from twin_master.run_folder import REPORT_NAME
 
     _write_to_output("", flush=True)
     if terminal.loudness.quiet:
@@ -256,12 +255,11 @@ def _print_end_of_watch(folder: Path, watched: "Watch", *, report: bool) -> None
 
 def _print_decision(watched: "Watch", decision: Decision, *, flush: bool) -> bool:
     """Print a decision and its notices; return whether the output still has a reader."""
-    from twin_master.mission.decision_record import decision_line
+    from twin_master.mission.decision_record import decision_line, with_folder
 
     # Notices go to the error stream, so that people see them also if a program reads the decisions.
     for notice in decision["notices"]:
-        sentence = notice["sentence"].replace(" DIR", f" {shlex.quote(str(watched.folder))}")
-        typer.secho(sentence, fg="yellow", err=True)
+        typer.secho(with_folder(notice["sentence"], watched.folder), fg="yellow", err=True)
     if terminal.loudness.quiet:
         return True
     is_for_people = sys.stdout.isatty()

@@ -12,9 +12,8 @@ import typer
 from reporting import terminal
 from reporting.files import atomic_write_text, refuse_filled
 from reporting.terminal import LARGEST_SEED, JsonOption, NoReportOption
-from uav_twin.completion import complete_model
 from uav_twin.discrepancy_commands import use_one_thread
-from uav_twin.options import CampaignArgument, DesignOption, SampleSeedOption
+from uav_twin.options import CampaignArgument, DesignOption, SampleSeedOption, complete_model
 
 if TYPE_CHECKING:
     from calibration.paper.figures import TableRow

@@ -14,6 +14,7 @@ from twin_master import (
     fleet_command,
     plan_command,
     scenario_command,
+    watch_command,
 )
 from uav_twin import (
     calibrate_commands,
@@ -27,9 +28,9 @@ from uav_twin import (
     structure,
     structure_from_deck,
     structure_suspects,
-    watch_command,
     wing_commands,
 )
+from uav_twin.cause_search import with_discrepancy_search
 
 MISSIONS = "Missions: a twin flies, plans and watches"
 MEASUREMENTS = "Measurements: calibrate a model, and find what it lacks"
@@ -101,6 +102,18 @@ def _add_group(name: str, panel: str, text: str) -> typer.Typer:
     return group
 
 
+def watch_with_search() -> Callable[..., None]:
+    """Return the command `uav-twin watch`, which can look for the cause of its alarms.
+
+    Typer reads the options of a command from its signature, and the search is not an option.
+    """
+    command_with_search = with_discrepancy_search(watch_command.watch)
+    signature = inspect.signature(watch_command.watch)
+    options = [option for name, option in signature.parameters.items() if name != "cause_search"]
+    vars(command_with_search)["__signature__"] = signature.replace(parameters=options)
+    return command_with_search
+
+
 def _add_group_command(
     name: str, panel: str, text: str, function: Callable[..., None]
 ) -> typer.Typer:
@@ -120,7 +133,7 @@ app.command("run", rich_help_panel=MISSIONS)(command.run)
 app.command("plan", rich_help_panel=MISSIONS)(plan_command.plan)
 app.command("design", rich_help_panel=MISSIONS)(plan_command.design)
 app.command("view", rich_help_panel=MISSIONS)(command.view)
-app.command("watch", rich_help_panel=MISSIONS)(watch_command.watch)
+app.command("watch", rich_help_panel=MISSIONS)(watch_with_search())
 app.command("compare", rich_help_panel=MISSIONS)(compare_command.compare)
 app.command("scenarios", rich_help_panel=MISSIONS)(scenario_command.list_scenarios)
 

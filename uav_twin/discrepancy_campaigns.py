@@ -12,8 +12,7 @@ from reporting import terminal
 from reporting.files import refuse_filled
 from reporting.terminal import LARGEST_SEED
 from reporting.words import comma_list, counted, in_one_line
-from uav_twin.completion import complete_effect
-from uav_twin.options import EffectFilesOption, ModelOption
+from uav_twin.options import EffectFilesOption, ModelOption, complete_effect
 
 if TYPE_CHECKING:
     from discrepancy.campaign.records import Campaign

@@ -19,8 +19,13 @@ from reporting import terminal
 from reporting.formats.former_options import accepts_former_options
 from reporting.progress import reporter, stage
 from reporting.terminal import LARGEST_SEED, JsonOption, NoReportOption
-from uav_twin.completion import complete_model
-from uav_twin.options import CampaignArgument, EffectFilesOption, ModelOption, ReplaceOption
+from uav_twin.options import (
+    CampaignArgument,
+    EffectFilesOption,
+    ModelOption,
+    ReplaceOption,
+    complete_model,
+)
 
 if TYPE_CHECKING:
     from discrepancy.campaign.records import Campaign

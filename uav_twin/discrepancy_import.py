@@ -12,9 +12,9 @@ from reporting import terminal
 from reporting.errors import FileNotWrittenError
 from reporting.files import refuse_filled
 from reporting.folders import whole_folder
-from uav_twin.completion import complete_model
 from uav_twin.discrepancy_campaigns import campaign_size, shell_arguments
 from uav_twin.import_dialogue import ImportCommand, ImportDialogue
+from uav_twin.options import complete_model
 
 if TYPE_CHECKING:
     from discrepancy.campaign.importing import LaboratoryImport

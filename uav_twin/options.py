@@ -1,15 +1,47 @@
-"""Arguments and options that several commands share, as annotations of parameters for Typer."""
+"""Arguments and options that several commands share, and the completion of names by the shell.
 
+They are annotations of parameters for Typer. Names of what is shipped are completed; where no name
+fits, the shell itself completes the paths of files.
+"""
+
+from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal, cast
 
 import typer
 
+import discrepancy
 from reporting.terminal import LARGEST_SEED
-from uav_twin.completion import complete_model, complete_structure
+from scenarios import structure_files
 
 if TYPE_CHECKING:
     from fmu_asset.compiled.platforms import Platform
+
+
+def _names_beginning_with(incomplete: str, names: Iterable[str]) -> list[str]:
+    """Return the names that begin with the typed text."""
+    return [name for name in names if name.startswith(incomplete)]
+
+
+def complete_structure(incomplete: str) -> list[str]:
+    """Return the shipped structures whose names begin with the typed text."""
+    return _names_beginning_with(incomplete, structure_files())
+
+
+def complete_model(incomplete: str) -> list[str]:
+    """Return the shipped lumped models and structures whose names begin with the typed text."""
+    # The folder is listed, because an import of its package would take long
+    folder = Path(discrepancy.__file__).parent / "lumped_models"
+    lumped_models = sorted(file.stem for file in folder.glob("*.toml"))
+    return _names_beginning_with(incomplete, [*lumped_models, *structure_files()])
+
+
+def complete_effect(incomplete: str) -> list[str]:
+    """Return the effects of the catalogue whose identifiers begin with the typed text."""
+    from discrepancy.catalogue.library import load_catalogue
+
+    return _names_beginning_with(incomplete, [effect.identifier for effect in load_catalogue()])
+
 
 CampaignArgument = Annotated[
     Path, typer.Argument(show_default=False, help="Folder with campaign.toml.")

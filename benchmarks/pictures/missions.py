@@ -20,7 +20,7 @@ from benchmarks.browser import open_browser
 from benchmarks.pictures.notebooks import folder_until_exit, notebook
 from benchmarks.pictures.picture import Drawing
 from reporting.pages.figures import to_png
-from twin_master.fleet.configuration import KIND, fleet_config
+from twin_master.fleet.configuration import fleet_config
 from twin_master.fleet.page.page_figures import course_figure, map_figure
 from twin_master.fleet.reading import last_steps
 from twin_master.fleet.storage.store import FAILED, flown_rows, open_group
@@ -88,7 +88,7 @@ def draw_stiffened_panel() -> Drawing:
 def draw_fleet() -> Drawing:
     """Draw the fleet of the notebook: its assets by health, and health over time."""
     folder = notebook("a_fleet_that_learns", "learn_from_fleet").folder / "runs" / "winter"
-    (record,) = fleet_config(folder, KIND)["fleet"]["groups"]
+    (record,) = fleet_config(folder)["fleet"]["groups"]
     scenario = Scenario.model_validate(record["scenarios"][0])
     group = open_group(folder, record["name"])
     status = stored_values(group, "status")

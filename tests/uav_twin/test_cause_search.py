@@ -12,7 +12,7 @@ from tests.twin_master.watch.conftest import wait_until
 from twin_master.errors import MissionInputError
 from twin_master.watch import workflow
 from twin_master.watch.cause_search import SearchRequest
-from uav_twin import watch_command
+from uav_twin import cli
 from uav_twin.cause_search import COMMAND, NICENESS, DiscrepancySearch, with_discrepancy_search
 
 # It writes its arguments, its session and its niceness into the log, and then waits to be ended.
@@ -77,7 +77,7 @@ def test_a_watch_gets_the_search_unless_another_one_is_given():
 
 def test_the_search_is_given_from_python_and_is_no_option_of_the_command():
     assert "cause_search" in inspect.signature(uav_twin.watch).parameters
-    assert "cause_search" not in inspect.signature(watch_command.watch).parameters
+    assert "cause_search" not in inspect.signature(cli.watch_with_search()).parameters
 
 
 def test_to_teach_without_a_search_is_refused_before_a_folder_is_made(tmp_path):

@@ -26,7 +26,12 @@ from twin_master.assets.asset_source import (
     table_of_observations,
 )
 from twin_master.assets.fmu_source import FMU_COPY, FmuSection
-from twin_master.assets.parameter import WING_CALIBRATION, ParameterDraws, check_calibration
+from twin_master.assets.parameter import (
+    NO_CALIBRATED_DESIGN,
+    WING_CALIBRATION,
+    ParameterDraws,
+    check_calibration,
+)
 from twin_master.assets.reduced_model import Advice, ReducedModelSource, StructureOfFile
 from twin_master.assets.structure_source import StructureFmuSource
 from twin_master.errors import MissionInputError
@@ -131,11 +136,7 @@ class _WingSource(StructureOfFile):
         from calibration.result.file import load_calibration
 
         if CALIBRATION_COPY not in self.file_paths:
-            raise MissionInputError(
-                "the scenario asks for the design of a calibration, but there is no calibration "
-                "file: "
-                'give --calibration, or `source = "file"` in the table `calibration`.'
-            )
+            raise MissionInputError(NO_CALIBRATED_DESIGN)
         return load_calibration(self.path(CALIBRATION_COPY))
 
     @cached_property

@@ -21,6 +21,10 @@ if TYPE_CHECKING:
 
 
 SAME_NAMES = "give parameters the same names in the model file of the calibration"
+NO_CALIBRATED_DESIGN = (
+    "the scenario asks for the design of a calibration, but there is no calibration file of a "
+    'wing: give --calibration, or `source = "file"` in the table `calibration`.'
+)
 WING_CALIBRATION = "give a calibration of the wing's own, which `uav-twin calibrate` makes"
 
 

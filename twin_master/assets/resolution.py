@@ -11,7 +11,7 @@ from pydantic import ConfigDict, Field
 from reporting.formats.toml_file import read_toml, validate
 from reporting.words import comma_list
 from twin_master.assets.asset_source import NO_ASSET, AssetSource, PairedSource, WatchedSource
-from twin_master.assets.parameter import is_of_parameters
+from twin_master.assets.parameter import NO_CALIBRATED_DESIGN, is_of_parameters
 from twin_master.assets.strain_library_source import FILE_NAME
 from twin_master.errors import MissionInputError
 from twin_master.network.transition import (
@@ -131,11 +131,7 @@ def resolve_scenario(
         design_table.get("design") == CALIBRATED_DESIGN_NAME
         for design_table in _design_tables(table)
     ):
-        raise MissionInputError(
-            "the scenario asks for the design of a calibration, but there is no calibration file: "
-            "give "
-            '--calibration, or `source = "file"` in the table `calibration`.'
-        )
+        raise MissionInputError(NO_CALIBRATED_DESIGN)
     source = str(loaded_scenario.path)
     if overrides.learnt:
         apply_learnt(table, overrides.learnt, overrides.learnt_group)

@@ -39,8 +39,6 @@ Decision = JsonRecord
 DecisionSink = Callable[[Decision], object]
 """A function that is called with each decision, once its step is in the journal."""
 _TEXT_CHARACTERS = 300
-JournalLine = JsonRecord
-"""A line of `journal.jsonl`; `docs/reference/run_folder.md` lists its keys."""
 
 
 class StepStatus(IntEnum):
@@ -335,7 +333,7 @@ class FolderFeed(RecordedFeed):
         except (KeyError, TypeError, ValueError, IndexError):
             return Refused("the line has another layout")
 
-    def _message_of(self, line: JournalLine) -> Message | Refused | None:
+    def _message_of(self, line: JsonRecord) -> Message | Refused | None:
         """Return the observation in a line of the journal; None if its step had no message.
 
         A journal of an asset with other sensors or controls is refused.

@@ -125,7 +125,7 @@ def choose_feed(
         The observations that the user names. If None, the recording in the scenario is used, and
         `default` if there is none.
     follow : bool
-        Whether to wait at the end of a CSV file for more.
+        Whether to wait at the end of a file of text for more.
     authority : Path or None
         The certificate file of a broker's authority.
 

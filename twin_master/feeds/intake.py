@@ -399,21 +399,19 @@ class Intake:
             return []
         notices = []
         words = self._words
-        when = f"{words.step.capitalize()} {self.observation_step}"
+        step = self.observation_step
         unreadable = reading.unreadable
         for sensor in sorted(unreadable.keys() - self._unreadable):
             sentence = (
-                f"{when}: {words.name_sensors([sensor])} shows no reading, and is left out until "
-                f"readings of it come back: {unreadable[sensor]}."
+                f"{words.name_step(step)}: {words.name_sensors([sensor])} shows no reading, and is "
+                f"left out until readings of it come back: {unreadable[sensor]}."
             )
             notices.append(Notice("gauge_left_out", sentence, (sensor + 1,)))
         readable_again = set()
         for sensor in sorted(self._unreadable - unreadable.keys()):
             if not np.isnan(reading.observed[sensor]):
                 readable_again.add(sensor)
-                name = words.name_sensors([sensor])
-                sentence = f"{when}: the readings of {name} are back, and used again."
-                notices.append(Notice("gauge_back", sentence, (sensor + 1,)))
+                notices.append(words.notice_of_return(step, sensor))
         self._unreadable = (self._unreadable | unreadable.keys()) - readable_again
         return notices
 

@@ -257,7 +257,11 @@ class GrowingFile(Lines):
             # The file may have been truncated after it was read, even if it has grown again.
             is_same = is_same_beginning(self._file, self._beginning)
             if not is_same or os.fstat(self._file.fileno()).st_size < self._file.tell():
-                yield from self._switch_after_cut(path)
+                yield from self._switch_to_copy(
+                    path,
+                    f"{path.name} was cut at byte {self.end}, and no copy is beside it: what "
+                    "followed and was not read yet is lost",
+                )
                 continue
             if not piece:
                 next_file = self._open_next(path)
@@ -312,32 +316,26 @@ class GrowingFile(Lines):
             yield None
             return
         self._was_missed = False
-        copy = find_file(path, self.position, follow=True)
-        if copy is None:
-            yield Refused(
-                f"the file that was {path.name} before was removed when it was read to byte "
-                f"{self.end}: what followed and was not read yet is lost"
-            )
-        file = (copy or path).open("rb", buffering=0)
-        yield from self._switch_to(file, is_copy=copy is not None)
+        yield from self._switch_to_copy(
+            path,
+            f"the file that was {path.name} before was removed when it was read to byte "
+            f"{self.end}: what followed and was not read yet is lost",
+        )
 
     def _note_beginning(self, piece: bytes) -> None:
         """Add a piece to the beginning that identifies the file, until it is long enough."""
         if len(self._beginning) < _PIECE_BYTES:
             self._beginning = (self._beginning + piece)[:_PIECE_BYTES]
 
-    def _switch_after_cut(self, path: Path) -> Iterator[bytes | Refused]:
-        """Continue in the copy of a truncated file, as logrotate makes it with `copytruncate`.
+    def _switch_to_copy(self, path: Path, reason_without_copy: str) -> Iterator[bytes | Refused]:
+        """Continue in the copy of a file, as logrotate makes it with `copytruncate`.
 
-        If there is no copy, a refusal is yielded, and reading continues at the beginning of the
-        file.
+        If there is no copy, the reason is yielded as a refusal, and reading continues at the
+        beginning of the file that has the name now.
         """
         copy = find_file(path, self.position, follow=True)
         if copy is None:
-            yield Refused(
-                f"{path.name} was cut at byte {self.end}, and no copy is beside it: what followed "
-                "and was not read yet is lost"
-            )
+            yield Refused(reason_without_copy)
         file = (copy or path).open("rb", buffering=0)
         yield from self._switch_to(file, is_copy=copy is not None)
 

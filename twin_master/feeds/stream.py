@@ -110,7 +110,7 @@ class StreamNotices:
         count = next_step - first_missing
         if count == 1:
             sentence = (
-                f"{step_name.capitalize()} {first_missing}: no message was received, and the "
+                f"{self._words.name_step(first_missing)}: no message was received, and the "
                 "belief is predicted over it"
             )
         else:
@@ -134,7 +134,7 @@ class StreamNotices:
         """
         step_name = self._words.step
         sentence = (
-            f"{step_name.capitalize()} {step}: counting begins with this message, which calls "
+            f"{self._words.name_step(step)}: counting begins with this message, which calls "
             f"itself {step_name} {number}."
         )
         self._pending.append(Notice("begin", sentence, value=float(number)))
@@ -158,7 +158,7 @@ class StreamNotices:
         self._clock_is_reported = True
         step_name = self._words.step
         sentence = (
-            f"{step_name.capitalize()} {next_step}: the message came after a pause of {steps} "
+            f"{self._words.name_step(next_step)}: the message came after a pause of {steps} "
             f"{step_name}s, in which the asset is taken to have rested, so that nothing has worn; "
             f'where {step_name}s go on without messages, give `watch.between = "steps"`'
             f"{unit_advice(unit)}."
@@ -241,7 +241,7 @@ class StreamNotices:
                 '`watch.between = "steps"`.'
             )
         sentence = (
-            f"{step_name.capitalize()} {next_step}: the {noun} of the message lies "
+            f"{self._words.name_step(next_step)}: the {noun} of the message lies "
             f"{abs(distance):.4g} {step_name}s {side} that of the message before{cause}. Counting "
             f"begins anew with this message, {belief}. Until two messages agree, each is taken as "
             f"the next {step_name}, and no gap can be seen.{remedy}"
@@ -324,7 +324,7 @@ class StreamNotices:
             The names in the message that are not sensors, each with the known name that was
             probably meant, in words, or an empty text.
         """
-        when = f"{self._words.step.capitalize()} {step}"
+        when = self._words.name_step(step)
         notices = self.pop_pending()
         if self._refusals_are_reported:
             count = self.refused_in_a_row

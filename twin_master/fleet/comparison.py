@@ -12,7 +12,7 @@ from reporting.arrays import Float
 from reporting.json_file import JsonRecord
 from reporting.words import between, plus_minus, rounded, significant
 from twin_master.fleet.configuration import fleet_config
-from twin_master.fleet.outcomes import Estimated, Moments, Outcomes
+from twin_master.fleet.outcomes import Estimated, Outcomes, RunningMoments
 from twin_master.fleet.reading import knowledge_of_scenario, notice_counts, open_groups
 from twin_master.fleet.storage.store import ENDED, FAILED, FLOWN, WITHIN, flown_rows
 from twin_master.fleet.storage.store_layout import row_blocks, stored_values
@@ -48,7 +48,7 @@ def earned_statistics(group: "xr.DataTree") -> dict[str, Statistic]:
     controls = list(group.attrs["controls"])
     keys_of_controls = [f"steps with {control}" for control in controls]
     moments = {
-        key: Moments()
+        key: RunningMoments()
         for key in (
             RETURN,
             "reward of a step",
@@ -202,7 +202,7 @@ def compare_fleets(folders: Sequence[Path]) -> Statistics:
                 statistics[named.name],
                 RETURN,
                 RETURN_PROMISED,
-                Estimated(expected_return.mean, expected_return.half_width / NORMAL_95),
+                Estimated(expected_return.mean, expected_return.standard_error),
             )
         # the difference from the first group, seed by seed
         if named is not first and RETURN in statistics[first.name]:
@@ -254,7 +254,7 @@ def _difference_of_returns(group: "xr.DataTree", other_group: "xr.DataTree") -> 
     _, rows, other_rows = np.intersect1d(
         seeds, other_seeds, assume_unique=True, return_indices=True
     )
-    moments = Moments()
+    moments = RunningMoments()
     moments.add(returns[rows] - other_returns[other_rows])
     return moments.mean
 

@@ -11,27 +11,15 @@ from reporting.json_file import JsonObject, JsonRecord
 from reporting.provenance import collect_provenance
 from twin_master import run_folder
 from twin_master.errors import RunFolderError
-from twin_master.fleet.plan import Group
 from twin_master.scenario import reading as scenario_reading
 
-KIND = "uav-twin fleet"
-"""The kind in the configuration of a fleet that is flown."""
-WATCHED_KIND = run_folder.WATCHED_FLEET_KIND
-"""The kind in the configuration of a fleet that is watched."""
 GROUPS = "groups"
 """The folder with the prepared knowledge of the twins of each group: model, policy and draws."""
-REPORT_NAME = "report.html"
-"""The page of a fleet in its folder."""
-
 _SCENARIOS = "fleet.groups.scenarios"
 PRESENT_NAMES = {
     f"{_SCENARIOS}.{location}": name for location, name in scenario_reading.PRESENT_NAMES.items()
 }
 """The present name of each key of a fleet's configuration, by its former location."""
-
-
-def _nothing_to_check() -> None:
-    """Accept a fleet without a check."""
 
 
 @contextmanager
@@ -41,7 +29,7 @@ def locked_fleet_folder(
     record: JsonRecord,
     *,
     replace_old: bool = False,
-    check: Callable[[], None] = _nothing_to_check,
+    check: Callable[[], None] | None = None,
 ) -> Iterator[JsonObject]:
     """Provide the folder of a fleet, which only this process uses, and its configuration.
 
@@ -50,12 +38,12 @@ def locked_fleet_folder(
     Parameters
     ----------
     kind : str
-        `KIND` or `WATCHED_KIND`.
+        `run_folder.FLEET_KIND` or `run_folder.WATCHED_FLEET_KIND`.
     record : mapping
         The record of the fleet for `config.json`.
     replace_old : bool
         Whether another fleet in the folder is removed.
-    check : callable
+    check : callable, optional
         Called before anything is written; it raises an error if the fleet cannot fly.
 
     Yields
@@ -72,22 +60,23 @@ def locked_fleet_folder(
     """
     config = {"kind": kind, "format": 1, "fleet": record}
     former_config = None if replace_old else run_folder.find_config(folder, kind)
-    if former_config is None:
+    if former_config is not None:
+        same_keys = {key: former_config.get(key) for key in config}
+        if same_keys != json.loads(run_folder.to_json(config)):
+            otherwise = ", or give --replace" if kind == run_folder.FLEET_KIND else ""
+            raise RunFolderError(
+                f"{folder} holds another fleet, or the same with other files: "
+                f"choose another --out{otherwise}."
+            )
+        run_folder.check_versions(folder, former_config, record["seed"])
+    if check is not None:
         check()
+    if former_config is None:
         provenance = collect_provenance(record["seed"]).as_dict()
         content = {**config, "provenance": provenance}
         with run_folder.create_run_folder(folder, content, replace=replace_old):
             yield config
         return
-    same_keys = {key: former_config.get(key) for key in config}
-    if same_keys != json.loads(run_folder.to_json(config)):
-        otherwise = ", or give --replace" if kind == KIND else ""
-        raise RunFolderError(
-            f"{folder} holds another fleet, or the same with other files: "
-            f"choose another --out{otherwise}."
-        )
-    run_folder.check_versions(folder, former_config, record["seed"])
-    check()
     with closing_lock(run_folder.lock_run_folder(folder)):
         yield config
 
@@ -105,7 +94,7 @@ def fleet_config(folder: Path, *kinds: str) -> JsonObject:
     RunFolderError
         If the folder does not hold such a fleet.
     """
-    config = run_folder.find_config(folder, *(kinds or (KIND,)))
+    config = run_folder.find_config(folder, *(kinds or (run_folder.FLEET_KIND,)))
     if config is None or "fleet" not in config:
         if folder.exists():
             raise RunFolderError(f"{folder} is not the folder of a fleet.")
@@ -114,6 +103,6 @@ def fleet_config(folder: Path, *kinds: str) -> JsonObject:
     return with_present_names(config, PRESENT_NAMES, file, RunFolderError)
 
 
-def group_folder(folder: Path, group: Group, scenario_number: int) -> Path:
-    """Return the folder with the prepared knowledge of a group's twins for a scenario."""
-    return folder / GROUPS / group.name / str(scenario_number)
+def knowledge_folder(folder: Path, group_name: str, scenario_number: int) -> Path:
+    """Return the folder with the prepared knowledge of a group's twins for one of its scenarios."""
+    return folder / GROUPS / group_name / str(scenario_number)

@@ -100,8 +100,7 @@ def fly_pieces(
         for piece in pieces:
             yield piece, _fly_piece(piece)
         return
-    with _connected_client(engine) as client:
-        progress.note(f"Dask dashboard: {client.dashboard_link}")
+    with _connected_client(engine, progress) as client:
         yield from _fly_by_workers(client, pieces)
 
 
@@ -227,8 +226,7 @@ def open_task_pool(engine: Engine, progress: Progress) -> Iterator[TaskPool]:
     if not engine.needs_dask:
         yield TaskPool(None)
         return
-    with _connected_client(engine) as client:
-        progress.note(f"Dask dashboard: {client.dashboard_link}")
+    with _connected_client(engine, progress) as client:
         yield TaskPool(client)
 
 
@@ -258,7 +256,7 @@ def _fly_piece(piece: Piece) -> ShardResult:
 
 
 @contextmanager
-def _connected_client(engine: Engine) -> "Iterator[Client]":
+def _connected_client(engine: Engine, progress: Progress) -> "Iterator[Client]":
     """Provide a client of the cluster, or of local workers that end with the context."""
     import dask
 
@@ -279,11 +277,12 @@ def _connected_client(engine: Engine) -> "Iterator[Client]":
     with dask.config.set(quiet_settings):
         logging.getLogger("distributed").setLevel(logging.CRITICAL)
         if engine.cluster is not None:
-            with _cluster_client(engine.cluster) as client:
-                yield client
+            connection = _cluster_client(engine.cluster)
         else:
-            with _local_client(engine.workers) as client:
-                yield client
+            connection = _local_client(engine.workers)
+        with connection as client:
+            progress.note(f"Dask dashboard: {client.dashboard_link}")
+            yield client
 
 
 @contextmanager

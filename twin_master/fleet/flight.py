@@ -29,7 +29,7 @@ from twin_master.errors import FleetError
 from twin_master.feeds.feed_choice import file_feed
 from twin_master.fleet.checks import check_fleet, flies_model, source_of
 from twin_master.fleet.comparison import group_statistics, statistic_rows
-from twin_master.fleet.configuration import KIND, group_folder, locked_fleet_folder
+from twin_master.fleet.configuration import knowledge_folder, locked_fleet_folder
 from twin_master.fleet.engine import Engine, Piece, fly_pieces
 from twin_master.fleet.learning.evidence import reason_transitions_are_fixed
 from twin_master.fleet.members import Member
@@ -180,11 +180,15 @@ def fly_fleet(
     def check() -> None:
         """Check what may keep the fleet from flying, before anything is written."""
         check_fleet(fleet)
-        if replace_old or run_folder.find_config(folder, KIND) is None:
+        if replace_old or run_folder.find_config(folder, run_folder.FLEET_KIND) is None:
             address.check_new(replace_old=replace_old)
 
     with locked_fleet_folder(
-        folder, KIND, fleet.record(), replace_old=replace_old, check=check
+        folder,
+        run_folder.FLEET_KIND,
+        fleet.record(),
+        replace_old=replace_old,
+        check=check,
     ) as config:
         if not (folder / JOURNAL_NAME).is_file():
             create_store(folder, fleet)
@@ -437,7 +441,7 @@ class _FleetFlight:
         group = self._fleet.groups[group_number]
         return prepare_kit(
             group.scenarios[scenario_number],
-            group_folder(self._folder, group, scenario_number),
+            knowledge_folder(self._folder, group.name, scenario_number),
             is_real=bool(group.observations),
             parts=self._fleet.parts,
         )

@@ -44,7 +44,7 @@ class Estimated:
     unit: str = ""
 
 
-class Moments:
+class RunningMoments:
     """Count, mean and sum of squared deviations of values that come block by block.
 
     The sums of two blocks are joined by the formulas of Chan, Golub and LeVeque (1983), which lose
@@ -170,10 +170,10 @@ class Outcomes:
         """
         prompt_fallbacks = Fraction()
         early_fallbacks = Fraction()
-        log_evidence = Moments()
-        credible = Moments()
-        mean_squares: list[Moments] = []  # of each factor
-        mean_errors: list[Moments] = []
+        log_evidence = RunningMoments()
+        credible = RunningMoments()
+        mean_squares: list[RunningMoments] = []  # of each factor
+        mean_errors: list[RunningMoments] = []
         for block in blocks:
             rows_flown = flown_rows(np.asarray(block("status")))
             values = {
@@ -193,8 +193,8 @@ class Outcomes:
             mean_square = (error**2).mean(axis=1).filled(np.nan).T
             mean_error = error.mean(axis=1).filled(np.nan).T
             if not mean_errors:
-                mean_squares = [Moments() for _ in mean_square]
-                mean_errors = [Moments() for _ in mean_error]
+                mean_squares = [RunningMoments() for _ in mean_square]
+                mean_errors = [RunningMoments() for _ in mean_error]
             for factor, squares in enumerate(mean_squares):
                 squares.add(mean_square[factor])
                 mean_errors[factor].add(mean_error[factor])

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from reporting.arrays import Float, Index, product_of_each
 from reporting.json_file import JsonRecord
-from twin_master.fleet.configuration import GROUPS, fleet_config
+from twin_master.fleet.configuration import fleet_config, knowledge_folder
 from twin_master.fleet.members import RecordedMembers
 from twin_master.fleet.storage.store import (
     check_installed,
@@ -202,21 +202,19 @@ def flown_twins(
     rows_flown = flown_rows(stored_values(group, "status"))
     scenario_numbers = RecordedMembers(record).scenario_numbers(rows_flown)
     for number in np.unique(scenario_numbers).tolist():
-        knowledge_folder = _knowledge_folder(folder, record, number)
         rows = rows_flown[scenario_numbers == number]
-        yield TwinsOfScenario(rows, knowledge_folder, knowledge_of_scenario(folder, record, number))
-
-
-def _knowledge_folder(folder: Path, record: JsonRecord, scenario_number: int) -> Path:
-    """Return the folder with the prepared knowledge of a scenario of a group."""
-    return folder / GROUPS / str(record["name"]) / str(scenario_number)
+        yield TwinsOfScenario(
+            rows,
+            knowledge_folder(folder, record["name"], number),
+            knowledge_of_scenario(folder, record, number),
+        )
 
 
 def knowledge_of_scenario(folder: Path, record: JsonRecord, scenario_number: int) -> Knowledge:
     """Return the knowledge of the twins of a scenario of a group."""
-    knowledge_folder = _knowledge_folder(folder, record, scenario_number)
+    prepared = knowledge_folder(folder, record["name"], scenario_number)
     scenario = Scenario.model_validate(record["scenarios"][scenario_number])
-    return load_knowledge(knowledge_folder, scenario.with_paths_from(knowledge_folder))
+    return load_knowledge(prepared, scenario.with_paths_from(prepared))
 
 
 class ControlForecast:
@@ -271,7 +269,7 @@ class ControlForecast:
             for control_index in np.unique(control_in_force[has_scenario]).tolist():
                 twins = has_scenario & (control_in_force == control_index)
                 probability[twins] = probability_of_leaving(knowledge, belief[twins], control_index)
-        # `unexplained` is the filter's probability that no state explains the observations.
+        # Nothing is predicted for twins that believe in no state of the model.
         is_unexplained = stored_values(group, "notice/none_of_these", rows)[at_last_step] > BELIEVED
         probability[is_unexplained] = np.nan
         return probability

@@ -89,9 +89,9 @@ class NoticeWriter:
                 self.highest_plausible[control_index, g],
             )
             sentence = (
-                f"{self._step_text(step)}: {self.wording.name_sensors([g])} shows {reading}, and "
-                f"no state can show less than {low} or more than {high}; its readings are left out "
-                "until they come back."
+                f"{self.wording.name_step(step)}: {self.wording.name_sensors([g])} shows "
+                f"{reading}, and no state can show less than {low} or more than {high}; its "
+                "readings are left out until they come back."
             )
             notices.append(Notice("gauge_left_out", sentence, (g + 1,), float(readings[g])))
         return notices
@@ -115,7 +115,7 @@ class NoticeWriter:
             since = round(float(still_since[g]))
             reading, noise = self.wording.format_values(g, readings[g], self.noise[g])
             sentence = (
-                f"{self._step_text(step)}: {self.wording.name_sensors([g])} is stuck: since "
+                f"{self.wording.name_step(step)}: {self.wording.name_sensors([g])} is stuck: since "
                 f"{self.wording.step} {since} it shows {reading} unchanged, in spite of noise of "
                 f"{noise}; its readings are left out until they move."
             )
@@ -126,14 +126,10 @@ class NoticeWriter:
         self, is_back: NDArray[np.bool_], readings: Float, step: int
     ) -> list[Notice]:
         """Return a notice for each gauge (G,) whose readings are used again."""
-        notices = []
-        for g in np.flatnonzero(is_back).tolist():
-            sentence = (
-                f"{self._step_text(step)}: the readings of {self.wording.name_sensors([g])} are "
-                "back, and used again."
-            )
-            notices.append(Notice("gauge_back", sentence, (g + 1,), float(readings[g])))
-        return notices
+        return [
+            self.wording.notice_of_return(step, g, float(readings[g]))
+            for g in np.flatnonzero(is_back).tolist()
+        ]
 
     def report_own_likelihood(self, sensor_model: GaussianSensorModel) -> list[Notice]:
         """Return the notice that alarms do not use the likelihood of a user's sensor model.
@@ -177,7 +173,7 @@ class NoticeWriter:
                 f"other {sensors} {in_brackets}. {or_the_asset}: these data cannot tell."
             )
         numbers = (followed_hypothesis,) if followed_hypothesis > 0 else ()
-        sentence = f"{self._step_text(step)}: {sentence}"
+        sentence = f"{self.wording.name_step(step)}: {sentence}"
         return [Notice("hypothesis", sentence, numbers, probability)]
 
     def advise_control(
@@ -197,7 +193,7 @@ class NoticeWriter:
                 f"no control tells {listing(hypotheses)} apart within {steps}: inspect the "
                 f"{self.wording.sensor}s, or measure with another sensor."
             )
-            return Notice("advice", f"{self._step_text(step)}: {sentence}")
+            return Notice("advice", f"{self.wording.name_step(step)}: {sentence}")
         steps_tell = (
             f"a {steps} under {best} tells" if is_one_step else f"{steps} under {best} tell"
         )
@@ -206,7 +202,9 @@ class NoticeWriter:
             f"{steps_tell} {listing(hypotheses)} apart best, if it is safe: with a probability of "
             f"{by_control[best]:.2f}{next_best}."
         )
-        return Notice("advice", f"{self._step_text(step)}: {sentence}", value=by_control[best])
+        return Notice(
+            "advice", f"{self.wording.name_step(step)}: {sentence}", value=by_control[best]
+        )
 
     def may_raise_alarm(
         self, state: WatchState, log_gauge: Float, log_free_gains: Float
@@ -315,14 +313,10 @@ class NoticeWriter:
             if first_step:
                 search += f" --from-step {first_step}"
         sentence = (
-            f"{self._step_text(step)}: {finding}, {since} (evidence {evidence_text} against the "
-            f"model, alarm from {self.threshold:g}){search}"
+            f"{self.wording.name_step(step)}: {finding}, {since} (evidence {evidence_text} against "
+            f"the model, alarm from {self.threshold:g}){search}"
         )
         return Notice("alarm", sentence, tuple(g + 1 for g in gauges), evidence, first_step)
-
-    def _step_text(self, step: int) -> str:
-        """Return the beginning of a sentence, such as "Step 12"."""
-        return f"{self.wording.step.capitalize()} {step}"
 
 
 def _largest(values: Float, least: float) -> list[int]:

@@ -128,27 +128,18 @@ class LearntExpectation:
         observations : (T, G) array
             The observed sensor values, SI.
         """
-        expectations = []
-        for step, belief, observation in zip(carried, beliefs, observations, strict=True):
-            hypotheses = self.learning.hypotheses(step)
-            expectations.append(
-                self._expect_step(hypotheses, step.control_index, belief, observation)
-            )
-        return stack_expectations(expectations)
+        hypotheses = (self.learning.hypotheses(step) for step in carried)
+        return self._expect_steps(hypotheses, carried, beliefs, observations)
 
     def smoothed(
         self, carried: Sequence[Carried], beliefs: Float, observations: Float
     ) -> Expectation:
         """Return the expectation in T steps given all observations; see `filtered`."""
-        joint_beliefs = self.learning.smoothed_hypotheses(carried)
-        steps = zip(carried, joint_beliefs, beliefs, observations, strict=True)
-        expectations = []
-        for step, joint_belief, belief, observation in steps:
-            hypotheses = self.learning.hypotheses(carried[-1], joint_belief)
-            expectations.append(
-                self._expect_step(hypotheses, step.control_index, belief, observation)
-            )
-        return stack_expectations(expectations)
+        hypotheses = (
+            self.learning.hypotheses(carried[-1], joint_belief)
+            for joint_belief in self.learning.smoothed_hypotheses(carried)
+        )
+        return self._expect_steps(hypotheses, carried, beliefs, observations)
 
     def predicted(
         self, carried: Sequence[Carried], beliefs: Float, policies: Float, horizon: int
@@ -256,23 +247,29 @@ class LearntExpectation:
         matrix = self.learning.model.transition.matrix
         return np.asarray(np.einsum("su,usn->sn", self.policy, matrix))
 
-    def _expect_step(
-        self, hypotheses: StaticHypotheses, control_index: int, belief: Float, observation: Float
+    def _expect_steps(
+        self,
+        hypotheses_of_steps: Iterable[StaticHypotheses],
+        carried: Sequence[Carried],
+        beliefs: Float,
+        observations: Float,
     ) -> Expectation:
-        """Return the expected sensor values and rewards in one step, without a leading axis.
+        """Return the expectation in T steps, each under its hypotheses and the control in force.
 
         Parameters
         ----------
-        belief : (S,) array
-            The belief about the state, which takes the place of that of the filter.
-        observation : (G,) array
+        beliefs : (T, S) array
+            The beliefs about the state, which take the place of those of the hypotheses.
+        observations : (T, G) array
             The observed sensor values, SI.
         """
-        controls = slice(control_index, control_index + 1)
-        weight = _joint_with_marginal(hypotheses.weight, belief)[None, :, :, None]
-        expectation = self._expect(hypotheses, weight, controls, observation)
-        fields_of_belief = {name: values[0] for name, values in vars(expectation).items()}
-        return Expectation(**fields_of_belief)
+        expectations = []
+        steps = zip(hypotheses_of_steps, carried, beliefs, observations, strict=True)
+        for hypotheses, step, belief, observation in steps:
+            controls = slice(step.control_index, step.control_index + 1)
+            weight = _joint_with_marginal(hypotheses.weight, belief)[None, :, :, None]
+            expectations.append(self._expect(hypotheses, weight, controls, observation))
+        return concatenate_expectations(expectations)
 
     def _expect_ahead(
         self, step: Carried, belief: Float, policy: Float, horizon: int

@@ -261,7 +261,7 @@ class LearningFilter:
             )
         else:
             finding = f"the {self._words.sensor}s do not saturate (probability {1.0 - after:.3g})"
-        return (Notice("hypothesis", f"{self._words.step.capitalize()} {step}: {finding}."),)
+        return (Notice("hypothesis", f"{self._words.name_step(step)}: {finding}."),)
 
     def _weight_of_fractions(self, weight: Float) -> Float:
         """Return the probability of each lost fraction (N,) from the hypotheses' weights (K,)."""

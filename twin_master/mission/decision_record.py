@@ -1,14 +1,15 @@
 """Decisions in a journal, as records and in words for the operator."""
 
+import shlex
+from pathlib import Path
+
 from reporting.json_file import JsonObject, JsonRecord
+from twin_master.mission.journal import KEPT_OF_SUSPICION
 from twin_master.mission.journal_packing import array_from_json
 from twin_master.network.estimator import is_state_believed
 from twin_master.network.graphical_model import GraphicalModel
 from twin_master.scenario.schema import Scenario
 from twin_master.scenario.section import printed_state
-
-_KEYS_OF_SUSPICION = ("none_of_these", "hypotheses", "decided_by")
-"""The entries of a suspicion that are copied into the decision."""
 
 
 def decision_from_line(line: JsonRecord, scenario: Scenario, model: GraphicalModel) -> JsonObject:
@@ -31,7 +32,7 @@ def decision_from_line(line: JsonRecord, scenario: Scenario, model: GraphicalMod
         return {}
     controls = scenario.control_names
     next_control = line["next_control"]
-    is_a_state_believed = is_state_believed(line.get("suspicion", {}).get("none_of_these", 0.0))
+    is_a_state_believed = is_state_believed(unexplained_probability(line))
     filtered_belief = array_from_json(line["filtered"])
     mean = model.states.mean(filtered_belief)
     deviation = model.states.standard_deviation(filtered_belief)
@@ -54,7 +55,7 @@ def decision_from_line(line: JsonRecord, scenario: Scenario, model: GraphicalMod
         "notices": line.get("notices", []),
     }
     if "suspicion" in line:
-        decision |= {key: line["suspicion"][key] for key in _KEYS_OF_SUSPICION}
+        decision |= {key: line["suspicion"][key] for key in KEPT_OF_SUSPICION}
     if "control_in_force" in line:
         decision["revised_by_step"] = line["observation_step"]
     if "learnt" in line:
@@ -63,6 +64,17 @@ def decision_from_line(line: JsonRecord, scenario: Scenario, model: GraphicalMod
     if message_step not in (None, line["step"]):
         decision["message_step"] = message_step
     return decision
+
+
+def unexplained_probability(line: JsonRecord) -> float:
+    """Return the probability that no state of the model explains the sensors; 0 without notices.
+
+    Parameters
+    ----------
+    line : mapping of str to object
+        The full record of a step in the journal.
+    """
+    return float(line.get("suspicion", {}).get("none_of_these", 0.0))
 
 
 def _step_by_messages(line: JsonRecord, numbers_per_step: int) -> int | None:
@@ -75,6 +87,14 @@ def _step_by_messages(line: JsonRecord, numbers_per_step: int) -> int | None:
         if steps >= 0:
             return int(first_number + steps * numbers_per_step)
     return None
+
+
+def with_folder(sentence: str, folder: Path) -> str:
+    """Return the sentence of a notice whose command names the folder of its run.
+
+    The sentence itself has DIR in the place of the folder, because the folder may be moved.
+    """
+    return sentence.replace(" DIR", f" {shlex.quote(str(folder))}")
 
 
 def health_in_words(decision: JsonRecord) -> dict[str, str]:

@@ -107,7 +107,7 @@ LARGE_PARTS = ("asset_state", "learnt", "settled", "suspicion")
 _LONGEST_DIFFERENCE = 9
 """Mean number of digits up to which differences are shorter than the values in base 64."""
 KEPT_OF_SUSPICION = ("none_of_these", "hypotheses", "decided_by")
-"""The entries of a suspicion that every line contains, for viewers and decisions."""
+"""The entries of a suspicion that every line contains; a decision has a copy of them."""
 
 
 def step_record(step: MissionStep) -> JsonObject:

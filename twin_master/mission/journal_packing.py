@@ -17,6 +17,7 @@ import numpy as np
 
 from reporting.arrays import Float
 from reporting.json_file import JsonObject
+from twin_master.network.estimator import MOMENTS
 
 PROBABILITY_DECIMALS = 10
 """Number of decimals of probabilities in a journal."""
@@ -96,7 +97,7 @@ def _pack_learnt(learnt: Mapping[str, Mapping[str, object]]) -> JsonObject:
     """Return names, units and all numbers of the learnt quantities."""
     numbers = []
     for quantity in learnt.values():
-        for name in ("mean", "standard_deviation", "lower", "upper"):
+        for name in MOMENTS:
             numbers.append(quantity[name])
     return {
         "names": list(learnt),
@@ -108,20 +109,13 @@ def _pack_learnt(learnt: Mapping[str, Mapping[str, object]]) -> JsonObject:
 def _unpack_learnt(packed: JsonObject) -> JsonObject:
     """Return the learnt quantities by name, as `_pack_learnt` packed them."""
     moments_of_quantities = (
-        np.array(unpack_numbers(packed["figures"]), dtype=object).reshape(-1, 4).tolist()
+        np.array(unpack_numbers(packed["figures"]), dtype=object).reshape(-1, len(MOMENTS)).tolist()
     )
     learnt = {}
     for name, unit, moments in zip(
         packed["names"], packed["units"], moments_of_quantities, strict=True
     ):
-        mean, standard_deviation, lower, upper = moments
-        learnt[name] = {
-            "mean": mean,
-            "standard_deviation": standard_deviation,
-            "lower": lower,
-            "upper": upper,
-            "unit": unit,
-        }
+        learnt[name] = {**dict(zip(MOMENTS, moments, strict=True)), "unit": unit}
     return learnt
 
 

@@ -210,9 +210,14 @@ class ComparedPolicy:
         return float(self.returns.mean())
 
     @property
+    def standard_error(self) -> float:
+        """The standard error of the mean."""
+        return float(self.returns.std() / np.sqrt(len(self.returns)))
+
+    @property
     def half_width(self) -> float:
         """The half width of the 95 % interval of the mean."""
-        return float(1.96 * self.returns.std() / np.sqrt(len(self.returns)))
+        return 1.96 * self.standard_error
 
     def beyond(self, other_policy: "ComparedPolicy") -> "ComparedPolicy":
         """Return the differences of the returns to another rule's, mission by mission."""

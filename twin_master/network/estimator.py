@@ -28,6 +28,10 @@ BELIEVED = 0.5
 Beyond one half, that explanation is more probable than all others together."""
 
 
+MOMENTS = ("mean", "standard_deviation", "lower", "upper")
+"""The stored numbers of each posterior; the last two bound the central 90 % interval."""
+
+
 def is_state_believed(none_of_these: float) -> bool:
     """Return whether the twin believes in any state.
 
@@ -98,7 +102,7 @@ class Learnt:
 
     @property
     def moments_and_bounds(self) -> tuple[float, float, float, float]:
-        """Mean, standard deviation, lower and upper bound."""
+        """The numbers of the posterior, in the order of `MOMENTS`."""
         return self.mean, self.standard_deviation, self.lower, self.upper
 
 
@@ -305,6 +309,24 @@ class NoticeWording:
         unit = self.units[sensor] if self.units else "1"
         unit_text = "" if unit == "1" else f" {unit}"
         return [f"{self.factor * value:.4g}{unit_text}" for value in values]
+
+    def name_step(self, step: int) -> str:
+        """Return the beginning of a sentence about a step, such as "Step 12"."""
+        return f"{self.step.capitalize()} {step}"
+
+    def notice_of_return(self, step: int, sensor: int, value: float | None = None) -> Notice:
+        """Return the notice that readings of a sensor, counted from 0, are used again.
+
+        Parameters
+        ----------
+        value : float, optional
+            The first of these readings, SI.
+        """
+        sentence = (
+            f"{self.name_step(step)}: the readings of {self.name_sensors([sensor])} are back, and "
+            "used again."
+        )
+        return Notice("gauge_back", sentence, (sensor + 1,), value)
 
     def name_sensors(self, sensors: Sequence[int]) -> str:
         """Return sensors, counted from 0, in words, such as "gauges 1 (root) and 3 (tip)"."""

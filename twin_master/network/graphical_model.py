@@ -20,6 +20,7 @@ from twin_master.network.transition import (
     TransitionModel,
     check_shape,
     distribution,
+    kronecker_product,
     stochastic_matrix,
 )
 from twin_master.scenario.schema import Scenario
@@ -341,19 +342,15 @@ class GraphicalModel:
             _check_factor_names(control, table, levels)
 
         # the joint prior is the product over the factors, the last factor varies fastest
-        joint_prior: Float = np.ones(1)
+        priors = []
         for factor in states.factors:
             size = len(factor.levels)
             certainly_lowest = np.eye(size)[0]
-            factor_prior = distribution(
-                certainly_lowest if prior is None else prior[factor.name],
-                size=size,
-                name=f"prior of {factor.name}",
-            )
-            joint_prior = np.asarray(np.kron(joint_prior, factor_prior), dtype=np.float64)
+            factor_prior = certainly_lowest if prior is None else prior[factor.name]
+            priors.append(distribution(factor_prior, size=size, name=f"prior of {factor.name}"))
         ordered_tables = [[tables[control][name] for name in levels] for control in tables]
         transition = TransitionModel.from_factors(ordered_tables)
-        return cls(states, tuple(tables), joint_prior, transition)
+        return cls(states, tuple(tables), kronecker_product(priors), transition)
 
     @cached_property
     def log_prior(self) -> Float:

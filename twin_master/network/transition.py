@@ -22,9 +22,8 @@ from reporting.system.memory import available_memory
 from reporting.words import comma_list
 from twin_master.errors import InvalidModelError, TwinMasterError
 from twin_master.network.kernels import PredecessorLists
+from twin_master.scenario.tables import ROW_SUM_TOLERANCE
 
-ROW_SUM_TOLERANCE = 1e-12
-"""Largest departure of the sum of a probability distribution from one."""
 BYTES_OF_NUMBER = 8
 """Size of a number in double precision [bytes]."""
 TRANSITION_COPIES = 3
@@ -364,7 +363,7 @@ class TransitionModel:
     def row(self, control: int, state: int) -> Float:
         """Return the distribution p(D_t | D_{t-1} = state, control) of the next state: (S,)."""
         levels = np.unravel_index(state, [block.shape[1] for block in self.blocks])
-        return _kronecker_product(
+        return kronecker_product(
             block[control, level] for block, level in zip(self.blocks, levels, strict=True)
         )
 
@@ -406,11 +405,11 @@ def _apply_along_axes(matrices: Sequence[Float], vectors: Float) -> Float:
     return vectors.reshape(shape)
 
 
-def _kronecker_product(arrays: Iterable[Float]) -> Float:
+def kronecker_product(arrays: Iterable[Float]) -> Float:
     """Return the Kronecker product of arrays, from the first to the last."""
     return reduce(lambda product, array: np.asarray(np.kron(product, array)), arrays)
 
 
 def _joint_table(factors: Sequence[Float]) -> Float:
     """Return the joint table (U, S, S) of factors (U, L, L)."""
-    return np.stack([_kronecker_product(tables) for tables in zip(*factors, strict=True)])
+    return np.stack([kronecker_product(tables) for tables in zip(*factors, strict=True)])

@@ -42,7 +42,7 @@ def learnt_figure(run: Run) -> Figure:
     )
     _draw_asset_quantities(grid, run, asset_quantities, labels)
     for (left_axes, right_axes), quantity in zip(grid[asset_rows:], sensor_quantities, strict=True):
-        most_departed = _most_departed_sensor(quantity)
+        most_departed = quantity.most_departed_sensor
         _draw_sensors_over_steps(left_axes, run, quantity, most_departed)
         style.panel_label(left_axes, next(labels), quantity.label)
         right_axes.sharey(left_axes)
@@ -81,20 +81,6 @@ def _draw_asset_quantities(
         grid_of_figure = left_axes.get_gridspec()
         if grid_of_figure is not None:
             left_axes.set_subplotspec(grid_of_figure[last_row, :])
-
-
-def _most_departed_sensor(quantity: LearntQuantity) -> int:
-    """Return the index of the sensor whose last mean is furthest from its prior mean.
-
-    The distance is measured in standard deviations of the last posterior.
-    """
-    last_moments = moments_of(quantity.posterior[-1])
-    prior_moments = moments_of(quantity.prior)
-    return int(
-        np.nanargmax(
-            np.abs(last_moments.mean - prior_moments.mean) / last_moments.standard_deviation
-        )
-    )
 
 
 def _draw_sensors_over_steps(axes: Axes, run: Run, quantity: LearntQuantity, sensor: int) -> None:

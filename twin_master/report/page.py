@@ -31,8 +31,8 @@ from twin_master.report.mission import default_present_row, mission_figure
 from twin_master.report.opening_sentences import opening_sentences
 from twin_master.report.reading import Run, read_run
 from twin_master.report.structure import design_of, mesh_figure, planform_figure, planform_of
+from twin_master.run_folder import REPORT_NAME
 from twin_master.store.summary import truth_mismatch
-from twin_master.store.writing import REPORT_NAME
 
 FIGURE_FOLDER = "figures"
 """The folder of the figures in a run folder."""

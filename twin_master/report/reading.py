@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 from reporting.arrays import Float
 from reporting.json_file import JsonObject, JsonRecord, read_json
 from twin_master.errors import RunFolderError, TwinMasterError
+from twin_master.mission.knowledge_file import CALIBRATION_NAME
+from twin_master.network.estimator import MOMENTS
 from twin_master.network.graphical_model import GraphicalModel, build_graphical_model
 from twin_master.network.inference import smooth
 from twin_master.run_folder import CONFIG_NAME
@@ -18,7 +20,6 @@ from twin_master.scenario.reading import parse_scenario
 from twin_master.scenario.schema import Scenario
 from twin_master.scenario.section import printed_state
 from twin_master.store.mission_result import (
-    MOMENTS,
     LearntQuantity,
     printed_unit_of_quantity,
     quantity_titles,
@@ -32,7 +33,6 @@ if TYPE_CHECKING:
 
 NORMAL_95 = 1.959963984540054
 """Half-width of a 95 % interval of the normal distribution, in standard deviations."""
-_CALIBRATION_NAME = "calibration.json"
 _SUBSCRIPTS = str.maketrans("0123456789", "₀₁₂₃₄₅₆₇₈₉")
 
 
@@ -352,7 +352,7 @@ def read_run(folder: Path) -> Run:
     tree = open_run(folder)
     config = _read_object(folder / CONFIG_NAME)
     summary = _read_object(folder / SUMMARY_NAME)
-    calibration = _read_object(folder / _CALIBRATION_NAME)
+    calibration = _read_object(folder / CALIBRATION_NAME)
     with RunFolderError.instead_of(
         TwinMasterError, after=" The run cannot be shown: fly it again."
     ):

@@ -16,13 +16,13 @@ from twin_master.mission.plant import Truth
 from twin_master.mission.preparation import Knowledge
 from twin_master.mission.replay import BelievedModel, spans_of_models
 from twin_master.mission.steps import History
-from twin_master.network.estimator import Learnt
+from twin_master.network.estimator import MOMENTS, Learnt
 from twin_master.scenario.schema import Scenario
 from twin_master.scenario.tables import probability_of
 from twin_master.store.schema import SCHEMA, SEVERAL_UNITS, scenario_fields
 
-MOMENTS = ("mean", "standard_deviation", "lower", "upper")
-"""The stored moments of each posterior; the last two bound the central 90 % interval."""
+MEAN = MOMENTS.index("mean")
+STANDARD_DEVIATION = MOMENTS.index("standard_deviation")
 
 _NAME_WITH_SENSOR = re.compile(r"(?P<quantity>\w+)\[(?P<sensor>\d+)\]")
 """The name of a quantity of one sensor, such as `noise_scale[3]`."""
@@ -92,6 +92,16 @@ class LearntQuantity:
     def is_per_sensor(self) -> bool:
         """Whether each sensor has a value of its own."""
         return self.posterior.ndim == 3
+
+    @property
+    def most_departed_sensor(self) -> int:
+        """The index of the sensor whose last mean is furthest from its prior mean.
+
+        The distance is measured in standard deviations of the last posterior.
+        """
+        last_moments = self.posterior[-1]  # (G, 4)
+        departure = np.abs(last_moments[:, MEAN] - self.prior[:, MEAN])
+        return int(np.nanargmax(departure / last_moments[:, STANDARD_DEVIATION]))
 
     @property
     def label(self) -> str:

@@ -12,11 +12,12 @@ from reporting.formats.table_file import table_text
 from twin_master.learning.expectation import Expectation
 from twin_master.mission.plant import SensorStatus, Truth
 from twin_master.mission.residuals import expected_ahead, expected_in_steps
+from twin_master.network.estimator import MOMENTS
 from twin_master.network.planner import BeliefPolicy
 from twin_master.scenario.observation import ObservationSection
 from twin_master.scenario.schema import REWARD_NAMES
 from twin_master.scenario.section import printed_state
-from twin_master.store.mission_result import MOMENTS, MissionResult
+from twin_master.store.mission_result import MissionResult
 from twin_master.store.schema import (
     SCHEMA,
     Entry,

@@ -16,7 +16,8 @@ from twin_master.network.graphical_model import StateSpace
 from twin_master.scenario.schema import REWARD_NAMES, SUMMARY_TITLES, Scenario
 from twin_master.scenario.section import printed_state
 from twin_master.store.mission_result import (
-    MOMENTS,
+    MEAN,
+    STANDARD_DEVIATION,
     LearntQuantity,
     MissionResult,
     printed_unit_of_quantity,
@@ -28,8 +29,6 @@ _MOST_CHANGES = 3
 """Largest number of changes of the control that the summary names."""
 TRUTH_IS_OFF = 3.0
 """Standard deviations beyond which the flown asset is not the one that was calibrated."""
-_MEAN = MOMENTS.index("mean")
-_STANDARD_DEVIATION = MOMENTS.index("standard_deviation")
 
 EntryValue = float | int | str | None
 
@@ -367,7 +366,7 @@ def _parameter_groups(result: MissionResult) -> Iterator[SummaryGroup]:
     parameter = learnt_parameters[0]
     fields = {"parameter": draws.name, "label": title}
     last_moments = parameter.posterior[-1]
-    moments = [float(last_moments[_MEAN]), float(last_moments[_STANDARD_DEVIATION])]
+    moments = [float(last_moments[MEAN]), float(last_moments[STANDARD_DEVIATION])]
     yield SummaryGroup("parameter_learnt", fields, [*moments, *prior])
     if parameter.truth is not None:
         yield SummaryGroup("parameter_true", fields, [float(parameter.truth)])
@@ -386,7 +385,7 @@ def _learnt_groups(result: MissionResult) -> Iterator[SummaryGroup]:
                 "unit": unit,
             }
             last_moments = factor * quantity.posterior[-1]
-            values = [float(last_moments[_MEAN]), float(last_moments[_STANDARD_DEVIATION])]
+            values = [float(last_moments[MEAN]), float(last_moments[STANDARD_DEVIATION])]
             yield SummaryGroup("learnt", fields, values)
 
 
@@ -400,10 +399,9 @@ def _group_of_sensors(result: MissionResult, quantity: LearntQuantity) -> Summar
     factor, unit = printed_unit_of_quantity(quantity.name, quantity.unit, result.scenario)
     # The moments after the last step, in printed units, with a row for each sensor
     last_moments = factor * quantity.posterior[-1]
-    last_mean = last_moments[:, _MEAN]
-    last_deviation = last_moments[:, _STANDARD_DEVIATION]
-    departure = np.abs(last_mean - factor * quantity.prior[:, _MEAN]) / last_deviation
-    sensor = int(np.nanargmax(departure))
+    last_mean = last_moments[:, MEAN]
+    last_deviation = last_moments[:, STANDARD_DEVIATION]
+    sensor = quantity.most_departed_sensor
     mean_of_sensors: float | None = float(np.nanmean(last_mean))
     if quantity.unit == SEVERAL_UNITS:  # sensors of different units have no mean
         mean_of_sensors = None

@@ -18,7 +18,7 @@ from reporting.words import brief, number, rounded
 from twin_master.assets.asset_source import AssetAndModel
 from twin_master.errors import NotResumableError, RunFolderError
 from twin_master.pictures import plot_belief
-from twin_master.run_folder import FIELD_NAME, read_config, to_json
+from twin_master.run_folder import FIELD_NAME, REPORT_NAME, read_config, to_json
 from twin_master.store.mission_result import MissionResult, learnt_record
 from twin_master.store.results import csv_tables, run_groups
 from twin_master.store.summary import (
@@ -38,7 +38,6 @@ if TYPE_CHECKING:
 RUN_NAME = "run.nc"
 SUMMARY_NAME = "summary.json"
 TIMING_NAME = "timing.json"
-REPORT_NAME = "report.html"
 CSV_FOLDER = "csv"
 _MEAN = "_mean"
 _STANDARD_DEVIATION = "_standard_deviation"

@@ -28,6 +28,7 @@ from twin_master.learning.expectation import (
     concatenate_expectations,
     expectation_of_draws,
 )
+from twin_master.mission.decision_record import unexplained_probability
 from twin_master.mission.journal import JOURNAL_NAME, records_in_file
 from twin_master.mission.journal_packing import array_from_json
 from twin_master.mission.knowledge_file import KNOWLEDGE_NAME, load_knowledge
@@ -395,7 +396,7 @@ class Flight:
         return StepBeliefs(
             probability=filtered_beliefs,
             is_believed=np.array(
-                [is_state_believed(_unexplained_probability(record)) for record in records]
+                [is_state_believed(unexplained_probability(record)) for record in records]
             ),
             expected=expectation,
             control_probability=np.array([record["decision_probability"] for record in records]),
@@ -433,7 +434,7 @@ class Flight:
         predicted_beliefs = predict(
             knowledge.model, filtered_belief, control, knowledge.plan.policy, horizon
         ).predicted
-        unexplained = _unexplained_probability(record)
+        unexplained = unexplained_probability(record)
         # p(state, control) = p(state) p(control | state), for n steps, S states, U controls
         joint = predicted_beliefs[..., None] * knowledge.policy_with_safest_control(
             unexplained
@@ -451,12 +452,6 @@ class Flight:
             expected=expectation,
             control_probability=joint.sum(axis=-2),
         )
-
-
-def _unexplained_probability(record: StepRecord) -> float:
-    """Return the probability that no state of the model explains the sensors in a step."""
-    hypotheses = record.get("suspicion", {}).get("hypotheses", {})
-    return float(hypotheses.get("none of these", 0.0))
 
 
 def _expectation_without_learning(

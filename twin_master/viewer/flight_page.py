@@ -21,6 +21,7 @@ from reporting.errors import ReportingError
 from reporting.json_file import plain
 from reporting.pages.page import Page, Section, render_page
 from twin_master.errors import TwinMasterError
+from twin_master.mission.decision_record import with_folder
 from twin_master.report.reading import (
     NORMAL_95,
     printed_factors,
@@ -240,10 +241,8 @@ class FlightPage:
         values["control"] = [record["control_index"] for record in records]
         sentences_of_steps = []
         for record in records:
-            # Commands in notices name the folder as DIR.
             sentences = [
-                notice["sentence"].replace(" DIR", f" {flight.folder}")
-                for notice in record["notices"]
+                with_folder(notice["sentence"], flight.folder) for notice in record["notices"]
             ]
             sentences_of_steps.append(sentences)
         values["notices"] = sentences_of_steps

@@ -17,7 +17,7 @@ _PLAIN_FIELDS = ("step", "control", "next_control", "state_believed", "lost_sens
 
 
 def decision_points(decision: Decision, asset: str, timestamp: int) -> Iterator[Point]:
-    """Yield the points of a decision; none before the first step.
+    """Yield the points of a decision; before the first step, those of its notices alone.
 
     Parameters
     ----------

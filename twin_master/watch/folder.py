@@ -11,13 +11,13 @@ from typing import NamedTuple
 from reporting.arrays import Float
 from reporting.errors import FileNotWrittenError
 from reporting.files import atomic_write_bytes, hash_record
-from reporting.json_file import JsonObject
+from reporting.json_file import JsonObject, JsonRecord
 from reporting.progress import Progress
 from reporting.system.operating_system import call_on_end_signal
 from twin_master.assets.asset_source import AssetSource, calibration_sentence
 from twin_master.assets.resolution import believed_source
 from twin_master.errors import MissionInputError
-from twin_master.feeds.feed import Decision, DecisionSink, Feed, JournalLine
+from twin_master.feeds.feed import Decision, DecisionSink, Feed
 from twin_master.feeds.intake import KEPT_SNAPSHOT_STEPS, Counts, Intake
 from twin_master.feeds.rejected import REJECTED_NAME
 from twin_master.mission.decision_record import decision_from_line
@@ -35,7 +35,7 @@ from twin_master.mission.preparation import prepare_knowledge
 from twin_master.mission.recent_parts import RecentParts, is_whole_step
 from twin_master.mission.replay import BelievedModel, replay
 from twin_master.mission.steps import MissionStep, log_notices, operate
-from twin_master.network.estimator import Notice
+from twin_master.network.estimator import Notice, NoticeWording
 from twin_master.network.twin import Twin
 from twin_master.run_folder import (
     PICTURE,
@@ -77,10 +77,6 @@ class GivenPatch(NamedTuple):
 
     file: Path
     from_step: int
-
-
-def _do_nothing() -> None:
-    """Do nothing; the default of the function that is called between two steps."""
 
 
 class Watch:
@@ -196,7 +192,7 @@ class Watch:
         self,
         feed: Feed,
         decide: DecisionSink,
-        between_steps: Callable[[], None] = _do_nothing,
+        between_steps: Callable[[], None] | None = None,
         *,
         step_limit: int | None = None,
         patch: GivenPatch | None = None,
@@ -233,10 +229,12 @@ class Watch:
             with call_on_end_signal(self.intake.request_end):
                 if unconfirmed is not None:
                     send(unconfirmed)
-                between_steps()
+                if between_steps is not None:
+                    between_steps()
                 for decision in self.decisions():
                     send(decision)
-                    between_steps()
+                    if between_steps is not None:
+                        between_steps()
         return self.intake.counts
 
     @contextmanager
@@ -302,7 +300,7 @@ class Watch:
             elif twin is self.twin:
                 return
 
-    def decision_of(self, line: JournalLine) -> JsonObject:
+    def decision_of(self, line: JsonRecord) -> JsonObject:
         """Return the decision in a line of the journal; empty if the line has none."""
         return decision_from_line(line, self.scenario, self.models[-1].knowledge.model)
 
@@ -314,7 +312,7 @@ class Watch:
         line = self.intake.journal_line(step, self.twin)
         notices = list(self.teaching.pending_notices)
         if self.is_quiet:
-            when = f"{self.scenario.mission.step_name.capitalize()} {line['step']}"
+            when = NoticeWording.of(self.scenario).name_step(line["step"])
             silence = self.seconds_since_step
             sentence = f"{when}: observations arrive again, after {silence:.0f} s."
             notices.append(Notice("heard", sentence).as_record())
@@ -342,7 +340,7 @@ class Watch:
         }
         self._append_line(line | fields)
 
-    def _append_line(self, line: JournalLine) -> None:
+    def _append_line(self, line: JsonRecord) -> None:
         """Add a line to the journal, and update the state of teaching with it.
 
         Most lines of steps are written without their large parts and without the state of teaching,

@@ -144,7 +144,7 @@ class WatchMetrics:
         return residual
 
     def _message_samples(self) -> Iterator[Sample]:
-        """Yield the counts of messages and notices, and the times of the watch."""
+        """Yield the counts of messages and notices, and the time since the last step."""
         counts = self.watch.intake.counts
         meanings = {
             "messages_received": (counts.received, "Messages that were read."),

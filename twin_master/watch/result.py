@@ -3,9 +3,8 @@
 from dataclasses import replace
 from itertools import takewhile
 
-from reporting.json_file import JsonObject
+from reporting.json_file import JsonObject, JsonRecord
 from twin_master.assets.asset_source import AssetAndModel
-from twin_master.feeds.feed import JournalLine
 from twin_master.feeds.intake import Counts
 from twin_master.feeds.rejected import REJECTED_NAME
 from twin_master.mission.journal import last_step, records_backwards
@@ -99,7 +98,7 @@ def notices_since(watch: Watch, first_step: int) -> list[tuple[int, Notice]]:
     return list(notices.values())
 
 
-def _step_of(line: JournalLine) -> int:
+def _step_of(line: JsonRecord) -> int:
     """Return the step of a line; 0 for the header and for a line before the first step."""
     return max(int(line.get("step", 0)), 0)
 

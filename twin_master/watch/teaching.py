@@ -9,9 +9,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from reporting.json_file import JsonObject
+from reporting.json_file import JsonObject, JsonRecord
 from twin_master.errors import MissionInputError
-from twin_master.feeds.feed import JournalLine
 from twin_master.mission.journal import damaged_line_error, records_backwards
 from twin_master.scenario.schema import Scenario
 from twin_master.watch.records import ModelRecord, VerdictRecord
@@ -154,7 +153,7 @@ class Teaching:
         for line in reversed(lines_since_state):
             self.take_line(line)
 
-    def take_line(self, line: JournalLine) -> None:
+    def take_line(self, line: JsonRecord) -> None:
         """Update the state with the next line of the journal."""
         if "model" in line:
             self._take_model(line["model"])
@@ -177,7 +176,7 @@ class Teaching:
         self.pending_notices += alarms
         self._note_alarms(alarms)
 
-    def _take_step(self, line: JournalLine) -> None:
+    def _take_step(self, line: JsonRecord) -> None:
         """Update the state with a step.
 
         Pending notices were given with this step; only further alarms count as new.

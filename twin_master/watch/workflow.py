@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import shutil
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import AbstractContextManager, closing, contextmanager
+from contextlib import AbstractContextManager, ExitStack, closing, contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
@@ -248,21 +248,13 @@ def _watch_config(folder: Path) -> JsonObject | None:
     return config if config is not None and config.get("watched") else None
 
 
-def _ignore_decision(decision: Decision) -> None:
-    """Do nothing with a decision; the default for `decide`."""
-
-
-def _ignore_watch(watch: Watch) -> None:
-    """Do nothing with a watch; the default for `begun`."""
-
-
 def watch(
     scenario: LoadedScenario | str | Path | None = None,
     observations: Observations | None = None,
     folder: Path | str | None = None,
     overrides: OverridesOrMapping | None = None,
     *,
-    decide: DecisionSink = _ignore_decision,
+    decide: DecisionSink | None = None,
     resume: bool = False,
     follow: bool = False,
     steps: int | None = None,
@@ -275,7 +267,7 @@ def watch(
     last: int = STORED_STEPS,
     report: bool = True,
     otherwise: str | None = None,
-    begun: Callable[[Watch], object] = _ignore_watch,
+    begun: Callable[[Watch], object] | None = None,
     metrics: str | int | None = None,
     line_protocol: Path | str | None = None,
     cause_search: CauseSearch | None = None,
@@ -298,13 +290,13 @@ def watch(
     overrides : Overrides or mapping, optional
         What differs from the file of the scenario: ``seed``, ``calibration``, ``library``,
         ``learnt``.
-    decide : callable
+    decide : callable, optional
         Called with the decision of each step, once the step is in the journal. If a kill may have
         kept the last decision of a resumed watch from being sent, it is called with that one first.
     resume : bool
         Whether to take up the watch in the folder.
     follow : bool
-        Whether to wait at the end of a CSV file for more.
+        Whether to wait at the end of a file of text for more.
     steps : int, optional
         The number of steps, with those of earlier processes, after which to end.
     model_patch : Path or str, optional
@@ -327,8 +319,8 @@ def watch(
         Whether to write the report.
     otherwise : str, optional
         The observations if neither `observations` nor the scenario names any.
-    begun : callable
-        Called with the watch once its folder is held, before anything is read.
+    begun : callable, optional
+        Called with the watch once its folder is locked, before anything is read.
     metrics : str or int, optional
         The port at which the figures of the watch are served for Prometheus while it goes on, or
         ``HOST:PORT``; without a host, only this machine can read them.
@@ -355,9 +347,7 @@ def watch(
     loaded_scenario = None if scenario is None else load_scenario(scenario)
     progress = progress or SilentProgress()
     patch = _given_patch(model_patch, from_step, resume=resume)
-    if loaded_scenario is None and (folder is None or not resume):
-        raise MissionInputError("a scenario is needed, or --resume with the folder of a watch.")
-    folder = _folder_of_watch(loaded_scenario, folder)
+    folder = _folder_of_watch(loaded_scenario, folder, resume=resume)
     reading_scenario = _scenario_for_reading(loaded_scenario, folder, allow_unknown=allow_unknown)
     if teach:
         _check_teaching(reading_scenario, cause_search)
@@ -377,12 +367,13 @@ def watch(
     )
     with serve_metrics(metrics) as metrics_server, opened as watched:
         try:
-            begun(watched)
-            decide = _also_for_monitoring(decide, metrics_server, line_protocol, watched)
+            if begun is not None:
+                begun(watched)
+            send = _sender(decide, metrics_server, line_protocol, watched)
             if isinstance(feed, Broker):
                 feed = MqttFeed(feed, watched, progress.note, reading_scenario)
             teacher = cause_search if teach else None
-            counts = _run(watched, feed, decide, teacher, step_limit=steps, patch=patch)
+            counts = _run(watched, feed, send, teacher, step_limit=steps, patch=patch)
             store_watch(watched, counts, last=last, report=report)
         except Exception as error:
             error.add_note(_advice_after_error(watched))
@@ -390,24 +381,25 @@ def watch(
     return watched.folder
 
 
-def _also_for_monitoring(
-    decide: DecisionSink,
+def _sender(
+    decide: DecisionSink | None,
     server: MetricsServer | None,
     line_protocol: Path | str | None,
     watched: Watch,
 ) -> DecisionSink:
-    """Extend the receiver of decisions: also serve each as metrics, and append it to a file.
+    """Return a function that sends a decision to the file, the metrics and the caller of a watch.
 
-    `server` and `line_protocol` are None if this is not wanted.
+    `line_protocol`, `server` and `decide` are None if this is not wanted.
     """
     name = watched.scenario.mission.name
-    sinks = [decide]
-    if server is not None:
-        metrics = server.attach(name, watched)
-        watched.progress.note(f"Metrics: {server.address}")
-        sinks.insert(0, metrics.note_decision)
+    sinks: list[DecisionSink] = []
     if line_protocol is not None:
-        sinks.insert(0, DecisionLines(Path(line_protocol), name).write)
+        sinks.append(DecisionLines(Path(line_protocol), name).write)
+    if server is not None:
+        watched.progress.note(f"Metrics: {server.address}")
+        sinks.append(server.attach(name, watched).note_decision)
+    if decide is not None:
+        sinks.append(decide)
 
     def send(decision: Decision) -> None:
         for sink in sinks:
@@ -427,12 +419,18 @@ def _given_patch(
     return GivenPatch(Path(model_patch), from_step)
 
 
-def _folder_of_watch(loaded_scenario: LoadedScenario | None, folder: Path | str | None) -> Path:
-    """Return the folder that the user names, or the default one of the scenario."""
-    if folder is not None:
-        return Path(folder)
-    assert loaded_scenario is not None, "a watch without a scenario is resumed in a folder"
-    return Path("runs", loaded_scenario.scenario.mission.name)
+def _folder_of_watch(
+    loaded_scenario: LoadedScenario | None, folder: Path | str | None, *, resume: bool
+) -> Path:
+    """Return the folder that the user names, or the default one of the scenario.
+
+    Only a watch that is resumed in a named folder can do without a scenario.
+    """
+    if folder is None and loaded_scenario is not None:
+        return Path("runs", loaded_scenario.scenario.mission.name)
+    if folder is None or (loaded_scenario is None and not resume):
+        raise MissionInputError("a scenario is needed, or --resume with the folder of a watch.")
+    return Path(folder)
 
 
 def _scenario_for_reading(
@@ -508,20 +506,21 @@ def _run(
     """
     # If the earlier process was killed, its last decision may not have been sent
     unconfirmed = None if is_stored(watched.folder) else watched.last_decision()
-    with closing(feed):
-        if cause_search is None:
-            return watched.run(
-                feed, decide, step_limit=step_limit, patch=patch, unconfirmed=unconfirmed
-            )
-        with closing(Tutor(watched, cause_search, wait=feed.replayable)) as tutor:
-            return watched.run(
-                feed,
-                decide,
-                tutor.teach,
-                step_limit=step_limit,
-                patch=patch,
-                unconfirmed=unconfirmed,
-            )
+    with ExitStack() as open_parts:
+        open_parts.enter_context(closing(feed))
+        between_steps = None
+        if cause_search is not None:
+            tutor = Tutor(watched, cause_search, wait=feed.replayable)
+            open_parts.enter_context(closing(tutor))
+            between_steps = tutor.teach
+        return watched.run(
+            feed,
+            decide,
+            between_steps,
+            step_limit=step_limit,
+            patch=patch,
+            unconfirmed=unconfirmed,
+        )
 
 
 def _advice_after_error(watched: Watch) -> str:

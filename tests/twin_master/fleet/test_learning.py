@@ -20,7 +20,7 @@ from tests.twin_master.runs import text_of, written
 from twin_master.assets.resolution import Overrides, resolve_scenario
 from twin_master.errors import FleetError, MissionInputError
 from twin_master.fleet.comparison import outcomes_of_group
-from twin_master.fleet.configuration import fleet_config, group_folder
+from twin_master.fleet.configuration import fleet_config, knowledge_folder
 from twin_master.fleet.learning.evidence import (
     TransitionFamily,
     reason_transitions_are_fixed,
@@ -389,7 +389,7 @@ def test_the_store_of_a_fleet_has_the_evidence_that_its_twins_had(tmp_path):
     folder = fly_fleet(fleet, tmp_path / "fleet").folder
     (stored,) = open_fleet(folder).values()
     (group,) = fleet.groups
-    known = load_knowledge(group_folder(folder, group, 0), group.scenarios[0])
+    known = load_knowledge(knowledge_folder(folder, group.name, 0), group.scenarios[0])
     rows = observation_rows(stored, known.scenario)
     control = stored["observed/control_index"].values.astype(int)
     assert np.isfinite(rows[:, 0, 24:]).all()
@@ -505,7 +505,7 @@ def test_assets_with_files_of_their_own_leave_a_control_by_plans_of_their_own(gr
     fleet, folder = grown
     (group,), (name,) = open_fleet(folder).values(), open_fleet(folder)
     scenario, home = fleet.groups[0].scenarios[0], tmp_path / "groups" / name
-    knowledge = load_knowledge(group_folder(folder, fleet.groups[0], 0), scenario)
+    knowledge = load_knowledge(knowledge_folder(folder, fleet.groups[0].name, 0), scenario)
     for place, control in enumerate((1, 0)):
         (home / str(place)).mkdir(parents=True)
         always = BeliefPolicy(np.ones((1, 25)), np.array([control]))
@@ -590,7 +590,7 @@ class GrownGroup:
         self.folder = folder
         self.plan = fleet.groups[0]
         self.scenario = self.plan.scenarios[0]
-        self.knowledge = load_knowledge(group_folder(folder, self.plan, 0), self.scenario)
+        self.knowledge = load_knowledge(knowledge_folder(folder, self.plan.name, 0), self.scenario)
         (self.store,) = open_fleet(folder).values()
         self.control = self.store["observed/control_index"].values[:, -1]
         self.loss = self.store["filtered/mean"].values[:, -1].astype(float).sum(axis=1)

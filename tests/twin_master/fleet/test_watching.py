@@ -39,7 +39,7 @@ from twin_master.fleet.page.view import ATTENTION_ROWS, serve_fleet
 from twin_master.fleet.plan import load_fleet
 from twin_master.fleet.reading import ControlForecast
 from twin_master.fleet.storage.store_layout import ALL_ROWS
-from twin_master.fleet.watched.watched_asset import WatchedAsset, read_standing
+from twin_master.fleet.watched.watched_asset import WatchedAsset, read_watched_state
 from twin_master.fleet.watched.watching import FleetWatch
 from twin_master.mission.journal import JOURNAL_NAME
 from twin_master.run_folder import lock_run_folder
@@ -233,7 +233,7 @@ def lost_assets(library_file: Path, tmp_path_factory: pytest.TempPathFactory) ->
     write_fleet(library_file, folder)
     alone = watch_alone(folder)
     with pytest.MonkeyPatch.context() as patch:
-        for name in ("SEARCH_SECONDS", "AGAIN_SECONDS"):
+        for name in ("SEARCH_SECONDS", "FIRST_WAIT_SECONDS"):
             patch.setattr(f"twin_master.fleet.watched.watching.{name}", 0.0)
         make_unwell(patch, "wing-2")
         return LostAssets(folder, alone)
@@ -663,7 +663,7 @@ class FollowedLogs:
 
     def last_steps(self) -> list[int]:
         """Return the last step of each asset that has one."""
-        assets = read_standing(self.out)["assets"].values()
+        assets = read_watched_state(self.out)["assets"].values()
         return [asset["last"]["step"] for asset in assets if asset["last"] is not None]
 
 

@@ -325,7 +325,7 @@ def test_an_ssp_file_keeps_the_parameters_of_the_scenario(folder):
     ("name", "changes", "given", "sentence"),
     [
         ("level_turns", (), LIBRARY | FILE, "a strain library brings its own samples"),
-        ("level_turns", (OF_CALIBRATION,), {}, "there is no calibration file: give --calibration"),
+        ("level_turns", (OF_CALIBRATION,), {}, "there is no calibration file of a wing: give --calibration"),
         (
             "three_fmus",
             (OF_CALIBRATION,),

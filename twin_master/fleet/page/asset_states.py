@@ -166,8 +166,9 @@ def states_of_watched_assets(group_record: JsonRecord, decided_assets: JsonRecor
     group_record : mapping
         The record of the group in `config.json`.
     decided_assets : mapping
-        The records of the assets of all groups by GROUP/NAME, as `read_standing` returns them. The
-        twin of each must have decided at least once: `last` of its record is the last decision.
+        The records of the assets of all groups by GROUP/NAME, as `read_watched_state` returns
+        them. The twin of each must have decided at least once: `last` of its record is the last
+        decision.
     """
     scenario = _scenario_of_group(group_record)
     prefix = f"{group_record['name']}/"

@@ -9,6 +9,7 @@ from matplotlib.ticker import MaxNLocator
 from reporting.arrays import Float
 from reporting.pages import figures as style
 from twin_master.fleet.reading import severity
+from twin_master.pictures import draw_states_of_twins
 from twin_master.report.reading import NORMAL_95, printed_factors
 from twin_master.scenario.schema import Scenario
 
@@ -80,9 +81,6 @@ def map_figure(scenario: Scenario, mean: Float, failed: int) -> Figure:
 def course_figure(scenario: Scenario, mean: Float, state: Float) -> Figure:
     """Draw the states of B assets over T steps, with a panel for each factor of the state.
 
-    Bands hold the central 50 % and 90 % of the assets' estimates; lines are the medians of the
-    estimates and, if it is known, of the true values.
-
     Parameters
     ----------
     mean : (B, T, F) array
@@ -92,22 +90,9 @@ def course_figure(scenario: Scenario, mean: Float, state: Float) -> Figure:
     """
     factors = printed_factors(scenario)
     figure, (panels,) = style.panels(1, len(factors), 2.4, 0.3, 0.45, wspace=0.25)
-    steps = np.flatnonzero(~np.isnan(mean).all(axis=(0, 2)))
     for number, (factor, axes) in enumerate(zip(factors, panels, strict=True)):
-        estimates = factor.scale * mean[:, steps, number]
-        truths = factor.scale * state[:, steps, number]
-        quantiles = np.nanquantile(estimates, [0.05, 0.25, 0.5, 0.75, 0.95], axis=0)
-        low, lower_quartile, medians, upper_quartile, high = quantiles
-        style.band(axes, steps, low, high, style.PRESENT)
-        style.band(axes, steps, lower_quartile, upper_quartile, style.PRESENT)
-        axes.plot(steps, medians, color=style.PRESENT, label="median of the filtered means")
-        is_truth_known = ~np.isnan(truths).all(axis=0)  # false after the end of all flights
-        true_median = np.nanmedian(truths[:, is_truth_known], axis=0)
-        axes.plot(
-            steps[is_truth_known],
-            true_median,
-            **style.TRUTH_LINE,
-            label="median of the true states",
+        draw_states_of_twins(
+            axes, factor.scale * mean[:, :, number], factor.scale * state[:, :, number]
         )
         axes.set_xlabel(scenario.mission.step_name)
         axes.set_ylabel(f"{factor.title} ({factor.unit})")

@@ -31,7 +31,7 @@ from reporting.pages.table import PageColumn, Table, number_column
 from reporting.words import counted
 from twin_master.errors import FleetError
 from twin_master.fleet.comparison import group_statistics, returns_of_group, statistic_rows
-from twin_master.fleet.configuration import KIND, REPORT_NAME, WATCHED_KIND, fleet_config
+from twin_master.fleet.configuration import fleet_config
 from twin_master.fleet.flight import endings_of
 from twin_master.fleet.learning.lessons import LESSONS_NAME, lesson_rows
 from twin_master.fleet.members import RecordedMembers
@@ -40,8 +40,9 @@ from twin_master.fleet.page.overview import GroupOverview, overview_of_group
 from twin_master.fleet.page.page_figures import course_figure, map_figure, returns_figure
 from twin_master.fleet.reading import open_groups
 from twin_master.fleet.storage.store import WITHIN
-from twin_master.fleet.watched.watched_asset import read_standing, watched_fleet_counts
+from twin_master.fleet.watched.watched_asset import read_watched_state, watched_fleet_counts
 from twin_master.report.reading import PrintedFactor, printed_factors
+from twin_master.run_folder import FLEET_KIND, REPORT_NAME, WATCHED_FLEET_KIND
 from twin_master.scenario.schema import Scenario
 
 WORDS = Words("twin_master.fleet.page")
@@ -96,8 +97,8 @@ def fleet_page(folder: Path, most_assets: int) -> Page:
     FleetError
         If the configuration or the results in the folder are damaged.
     """
-    config = fleet_config(folder, KIND, WATCHED_KIND)
-    is_watched = config["kind"] == WATCHED_KIND
+    config = fleet_config(folder, FLEET_KIND, WATCHED_FLEET_KIND)
+    is_watched = config["kind"] == WATCHED_FLEET_KIND
     fleet = config["fleet"]
     add_content = _watched_fleet_page if is_watched else _flown_fleet_page
     before = f"{folder} is damaged or of another version ("
@@ -252,11 +253,11 @@ def _watched_fleet_page(
 
     `groups` are the records of the fleet's groups.
     """
-    standing = read_standing(folder)
-    assets = standing["assets"]
-    failures = standing["failures"]
+    state = read_watched_state(folder)
+    assets = state["assets"]
+    failures = state["failures"]
     stepped_assets = {name: asset for name, asset in assets.items() if asset["last"] is not None}
-    counts = watched_fleet_counts(standing)
+    counts = watched_fleet_counts(state)
     asset_count = counted(len(assets | failures), "asset")
     notices: list[Block] = []
     if failures:

@@ -8,12 +8,11 @@ from pathlib import Path
 from reporting.errors import ReportingError
 from reporting.pages.page import render_page
 from twin_master.errors import TwinMasterError
-from twin_master.fleet.configuration import KIND, WATCHED_KIND
 from twin_master.fleet.learning.lessons import LESSONS_NAME
 from twin_master.fleet.page.report import fleet_page
 from twin_master.fleet.watched.watched_asset import STATE_NAME
 from twin_master.mission.journal import JOURNAL_NAME
-from twin_master.run_folder import find_config
+from twin_master.run_folder import FLEET_KIND, WATCHED_FLEET_KIND, find_config
 from twin_master.viewer.server import (
     ServedText,
     is_always_wanted,
@@ -27,7 +26,7 @@ ATTENTION_ROWS = 50
 
 def is_fleet(folder: Path) -> bool:
     """Return whether a folder is that of a fleet, flown or watched."""
-    return find_config(folder, KIND, WATCHED_KIND) is not None
+    return find_config(folder, FLEET_KIND, WATCHED_FLEET_KIND) is not None
 
 
 def serve_fleet(

@@ -70,19 +70,25 @@ class Watcher(Protocol):
     def has_all_steps(self, asset: WatchedAsset) -> bool:
         """Return whether an asset has reached the requested number of steps."""
 
-    def lose(self, key: str, error: Exception) -> None:
-        """Stop watching an asset because of an error."""
+    def interrupt(self, key: str, error: Exception) -> None:
+        """Interrupt the watch of an asset because of an error."""
 
 
-class Source(Protocol):
+class ObservationSource(Protocol):
     """The observations of a group of real assets."""
 
     @property
     def has_ended(self) -> bool:
         """Whether all observations are read and no more can come."""
 
-    def look(self, *, for_new_assets: bool) -> int:
-        """Process the new observations of all assets, and return the number of new steps."""
+    def poll(self, *, searches: bool) -> int:
+        """Process the new observations of all assets, and return the number of new steps.
+
+        Parameters
+        ----------
+        searches : bool
+            Whether a search for new assets is due, which is not made at every poll.
+        """
 
 
 class FileSource:
@@ -123,20 +129,20 @@ class FileSource:
                 return False
         return True
 
-    def look(self, *, for_new_assets: bool) -> int:
+    def poll(self, *, searches: bool) -> int:
         """Process the new lines of all assets' files, and return the number of new steps.
 
         Parameters
         ----------
-        for_new_assets : bool
-            Whether to search first for files of new assets.
+        searches : bool
+            Whether a search is due: for files of new assets.
         """
-        if for_new_assets:
+        if searches:
             for path in recording_files(self._group.observations):
                 name = asset_name(path)
                 if self._files.get(name, path) != path:
                     error = FleetError("another file has the same name.")
-                    self._watcher.lose(f"{self._group.name}/{name} of {path.name}", error)
+                    self._watcher.interrupt(f"{self._group.name}/{name} of {path.name}", error)
                 elif not self._follow or _has_whole_header(path):
                     self._files[name] = path
         scenario = self._group.scenarios[0]  # real assets of a group share one scenario
@@ -179,16 +185,16 @@ class TopicSource:
         self._messages: Iterator[BrokerMessage | None] = self._session.receive(0.0)
         self._topics: dict[str, Topic] = {}
 
-    def look(self, *, for_new_assets: bool) -> int:
+    def poll(self, *, searches: bool) -> int:
         """Process the messages that the broker has sent; return the number of steps.
 
         A message on a new topic begins the watch of a new asset.
 
         Parameters
         ----------
-        for_new_assets : bool
-            Whether to process first the messages that wait in the queues of all known topics. They
-            came while the watch of their asset was interrupted by an error.
+        searches : bool
+            Whether a search is due: the queues of all known topics are processed first, because
+            messages came while the watch of their asset was interrupted by an error.
         """
         begin = time.monotonic()
         steps = 0
@@ -198,7 +204,7 @@ class TopicSource:
             group_folder = self._watcher.folder / self._group.name
             for path in sorted(group_folder.glob(f"*/{CONFIG_NAME}")):
                 self._find_topic(path.parent.name)
-        if for_new_assets:
+        if searches:
             for name in list(self._topics):
                 steps += self._advance(name)
         while not self._watcher.is_end_requested:
@@ -226,9 +232,9 @@ class TopicSource:
     def _find_topic(self, name: str) -> Topic | None:
         """Return the topic of an asset, created if it is new; None if there are too many."""
         if name not in self._topics and len(self._topics) < LARGEST_FLEET:
-            lose = partial(self._watcher.lose, f"{self._group.name}/{name}")
+            interrupt = partial(self._watcher.interrupt, f"{self._group.name}/{name}")
             self._topics[name] = Topic(
-                self._session, self._topic_prefix + name, self._group.scenarios[0], lose
+                self._session, self._topic_prefix + name, self._group.scenarios[0], interrupt
             )
         return self._topics.get(name)
 

@@ -19,7 +19,7 @@ _KEPT_OF_DECISION = ("step", "control", "next_control", "probability", "health")
 """The entries of an asset's last decision that are kept."""
 
 
-def read_standing(folder: Path) -> JsonObject:
+def read_watched_state(folder: Path) -> JsonObject:
     """Read the last decisions and alarms of the assets of a watched fleet.
 
     Returns
@@ -42,19 +42,19 @@ def read_standing(folder: Path) -> JsonObject:
     path = folder / STATE_NAME
     if not path.is_file():
         return {"assets": {}, "failures": {}}
-    standing = dict(read_json(path, FleetError))
-    return with_present_names(standing, {"assets.*.last.turn": "step"}, str(path), FleetError)
+    state = dict(read_json(path, FleetError))
+    return with_present_names(state, {"assets.*.last.turn": "step"}, str(path), FleetError)
 
 
-def watched_fleet_counts(standing: JsonRecord) -> dict[str, int]:
+def watched_fleet_counts(state: JsonRecord) -> dict[str, int]:
     """Return the numbers of a watched fleet by their titles: assets, steps, alarms and others.
 
     Parameters
     ----------
-    standing : mapping
-        The records of all assets, from `read_standing`.
+    state : mapping
+        The records of all assets, from `read_watched_state`.
     """
-    asset_records = standing["assets"].values()
+    asset_records = state["assets"].values()
     steps = 0
     for asset_record in asset_records:
         last_decision = asset_record["last"]
@@ -65,7 +65,7 @@ def watched_fleet_counts(standing: JsonRecord) -> dict[str, int]:
         "steps": steps,
         "alarms": sum(asset_record["alarms"] for asset_record in asset_records),
         "messages refused": sum(asset_record["refused"] for asset_record in asset_records),
-        "not watched": len(standing["failures"]),
+        "not watched": len(state["failures"]),
     }
 
 
@@ -126,7 +126,7 @@ class WatchedAsset:
             watch.filtered = watch.twin.estimator.smoothed(last_carried)[0]
 
     def record(self) -> JsonObject:
-        """Return the last decision and the alarms of the asset; see `read_standing`."""
+        """Return the last decision and the alarms of the asset; see `read_watched_state`."""
         record: JsonObject = {
             "last": None,
             "alarms": self._previous_alarms + len(self.alarms),

@@ -17,12 +17,17 @@ from reporting.system.operating_system import allow_many_files
 from twin_master.errors import FleetError
 from twin_master.feeds.broker_address import is_broker
 from twin_master.feeds.feed import Feed
-from twin_master.fleet.configuration import WATCHED_KIND, locked_fleet_folder
+from twin_master.fleet.configuration import locked_fleet_folder
 from twin_master.fleet.plan import Fleet, Group
-from twin_master.fleet.watched.watch_sources import LARGEST_FLEET, FileSource, Source, TopicSource
-from twin_master.fleet.watched.watched_asset import STATE_NAME, WatchedAsset, read_standing
+from twin_master.fleet.watched.watch_sources import (
+    LARGEST_FLEET,
+    FileSource,
+    ObservationSource,
+    TopicSource,
+)
+from twin_master.fleet.watched.watched_asset import STATE_NAME, WatchedAsset, read_watched_state
 from twin_master.mission.plant import FLIGHT_ERRORS
-from twin_master.run_folder import CONFIG_NAME
+from twin_master.run_folder import CONFIG_NAME, WATCHED_FLEET_KIND
 from twin_master.watch.folder import Watch
 from twin_master.watch.mqtt import Topic
 from twin_master.watch.workflow import begin_watch, resume_watch
@@ -31,18 +36,18 @@ SEARCH_SECONDS = 2.0
 """Time between two searches for new assets [s]."""
 STATE_SECONDS = 2.0
 """Shortest time between two writings of the state [s]."""
-AGAIN_SECONDS = 30.0
+FIRST_WAIT_SECONDS = 30.0
 """Time until the watch of an asset is resumed after an error [s].
 
 It doubles each time the same error comes again.
 """
-LONGEST_AGAIN = 3600.0
+LONGEST_WAIT_SECONDS = 3600.0
 """Largest time until the watch of an asset is resumed after an error [s]."""
 IDLE_SECONDS = 0.05
 """Shortest pause if no message has come [s]."""
 LONGEST_IDLE = 1.0
 """Longest pause if no message has come [s]."""
-BUSY_SHARE = 0.2
+BUSY_FRACTION = 0.2
 """Fraction of a processor's time that polling sources without new messages may take."""
 FURTHER_FILES = 60
 """Files beside the observations that are followed: what is opened for a moment, and connections.
@@ -56,24 +61,20 @@ _ASSET_NAME = re.compile(r"\w[\w.-]{0,63}")
 
 
 @dataclass
-class _Loss:
+class _Interruption:
     """An error that has interrupted the watch of an asset.
 
     Attributes
     ----------
     wait : float
         The time from the error until the watch is resumed [s].
-    again : float
+    resume_time : float
         The time on the monotonic clock at which the watch is resumed [s].
     """
 
     sentence: str
     wait: float
-    again: float
-
-
-def _do_nothing() -> None:
-    """Do nothing after a poll of all sources."""
+    resume_time: float
 
 
 class FleetWatch:
@@ -84,7 +85,7 @@ class FleetWatch:
     folder : Path
         The folder of the fleet, with the folder of a watch for each asset; a fleet that was watched
         there before is resumed.
-    tell : callable
+    receive_decision : callable
         Called with the asset and each of its decisions, once the decision is in the journal.
     note : callable
         Called with sentences for the operator: about brokers, and errors that interrupt the watch
@@ -107,8 +108,8 @@ class FleetWatch:
     ----------
     assets : dict of str to WatchedAsset
         The watched assets by GROUP/NAME, without those that an error has interrupted.
-    standing : dict
-        The records of all assets as last written to the file; see `read_standing`.
+    state : dict
+        The records of all assets as last written to the file; see `read_watched_state`.
     is_end_requested : bool
         Whether the watch is to end after the present step.
     """
@@ -117,7 +118,7 @@ class FleetWatch:
         self,
         fleet: Fleet,
         folder: Path,
-        tell: Callable[[WatchedAsset, JsonRecord], None],
+        receive_decision: Callable[[WatchedAsset, JsonRecord], None],
         note: Callable[[str], None],
         *,
         follow: bool = False,
@@ -129,22 +130,24 @@ class FleetWatch:
         self.is_end_requested = False
         self.folder_locks = ExitStack()
         self.final_actions = ExitStack()
-        self._tell = tell
+        self._receive_decision = receive_decision
         self._note = note
         self._wanted_steps = steps
-        self._lost: dict[str, _Loss] = {}
+        self._interruptions: dict[str, _Interruption] = {}
         # The first watch of each group: the other watches share the knowledge of its twin.
         self._sibling: dict[str, Watch] = {}
         _check_observed(fleet)
-        self._sources: list[Source] = []
+        self._sources: list[ObservationSource] = []
         for group in fleet.groups:
             if is_broker(group.observations):
                 self._sources.append(TopicSource(self, group, authority))
             else:
                 self._sources.append(FileSource(self, group, follow=follow))
-        self.folder_locks.enter_context(locked_fleet_folder(folder, WATCHED_KIND, _record(fleet)))
-        self.standing = read_standing(folder)
-        self._records_of_lost = dict(self.standing["assets"])
+        self.folder_locks.enter_context(
+            locked_fleet_folder(folder, WATCHED_FLEET_KIND, _record(fleet))
+        )
+        self.state = read_watched_state(folder)
+        self._records_of_interrupted = dict(self.state["assets"])
         self._most_followed_files = allow_many_files() - FURTHER_FILES
 
     def note(self, sentence: str) -> None:
@@ -154,7 +157,11 @@ class FleetWatch:
     @property
     def failures(self) -> dict[str, str]:
         """The errors of the assets whose watch is interrupted, by GROUP/NAME."""
-        return {key: loss.sentence for key, loss in self._lost.items() if key not in self.assets}
+        return {
+            key: interruption.sentence
+            for key, interruption in self._interruptions.items()
+            if key not in self.assets
+        }
 
     @property
     def complaints(self) -> dict[str, str]:
@@ -166,12 +173,12 @@ class FleetWatch:
                 complaints[key] = complaint
         return complaints
 
-    def run(self, after_look: Callable[[], None] = _do_nothing) -> None:
+    def run(self, after_poll: Callable[[], None] | None = None) -> None:
         """Watch until all files are read to their end, or until the end is requested.
 
         Parameters
         ----------
-        after_look : callable
+        after_poll : callable, optional
             Called after each poll of all sources.
 
         Raises
@@ -192,19 +199,18 @@ class FleetWatch:
                     is_search_due = begin - last_search >= SEARCH_SECONDS
                     if is_search_due:
                         last_search = begin
-                    steps = sum(
-                        source.look(for_new_assets=is_search_due) for source in self._sources
-                    )
+                    steps = sum(source.poll(searches=is_search_due) for source in self._sources)
                     if begin >= next_state:
                         self._write_state()
                         seconds = time.monotonic() - begin
                         next_state = begin + max(STATE_SECONDS, seconds / STATE_BYTES_PER_STEP)
-                    after_look()
+                    if after_poll is not None:
+                        after_poll()
                     if steps == 0:
                         if all(source.has_ended for source in self._sources):
                             return
                         # In proportion to the duration of the poll without new messages
-                        idle_seconds = (time.monotonic() - begin) / BUSY_SHARE
+                        idle_seconds = (time.monotonic() - begin) / BUSY_FRACTION
                         time.sleep(min(max(IDLE_SECONDS, idle_seconds), LONGEST_IDLE))
             finally:
                 self._write_state()
@@ -229,33 +235,35 @@ class FleetWatch:
             The largest number of steps to process; by default all that have come.
         """
         key = f"{group.name}/{name}"
-        is_waiting = key in self._lost and time.monotonic() < self._lost[key].again
+        is_waiting = (
+            key in self._interruptions and time.monotonic() < self._interruptions[key].resume_time
+        )
         if self.is_end_requested or (key not in self.assets and is_waiting):
             return 0
         steps = 0
         try:
             if key not in self.assets:
-                self._take_up(group, name, open_feed())
+                self._begin_or_resume(group, name, open_feed())
             asset = self.assets[key]
             if self.has_all_steps(asset):
                 return 0
             for decision in asset.watch.decisions():
-                if key in self._lost:
-                    del self._lost[key]
+                if key in self._interruptions:
+                    del self._interruptions[key]
                     self.note(f"{key} is watched again.")
-                self._hand_on(asset, decision)
+                self._pass_on(asset, decision)
                 steps += 1
                 if steps == most_steps or self.has_all_steps(asset) or self.is_end_requested:
                     break
             if steps == 0 and not asset.watch.intake.has_ended:
-                asset.watch.report_silence(partial(self._hand_on, asset))
+                asset.watch.report_silence(partial(self._pass_on, asset))
             if not asset.keeps_file_open:
                 asset.feed.release_file()
         except Exception as error:  # noqa: BLE001 - whatever happens to one asset, the others go on
-            self.lose(key, error)
+            self.interrupt(key, error)
         return steps
 
-    def _take_up(self, group: Group, name: str, feed: Feed) -> None:
+    def _begin_or_resume(self, group: Group, name: str, feed: Feed) -> None:
         """Begin or resume the watch of an asset, and hand on its last decision if that is due.
 
         An error is raised if the name cannot be that of a folder, or if there are too many assets.
@@ -279,7 +287,7 @@ class FleetWatch:
         if last_decision is not None and last_decision["step"] >= asset.first_new_step:
             # The former process may have been killed after it wrote the decision to the journal
             # and before it handed the decision on.
-            self._hand_on(asset, last_decision)
+            self._pass_on(asset, last_decision)
 
     def _open_asset(self, group: Group, name: str, feed: Feed) -> WatchedAsset:
         """Begin or resume the watch of an asset in its locked folder."""
@@ -311,26 +319,26 @@ class FleetWatch:
                 key,
                 watch,
                 feed,
-                self._records_of_lost.get(key),
+                self._records_of_interrupted.get(key),
                 keeps_file_open=len(self.assets) < self._most_followed_files,
             )
             asset.close = closing.pop_all().close
         return asset
 
-    def _hand_on(self, asset: WatchedAsset, decision: JsonObject) -> None:
+    def _pass_on(self, asset: WatchedAsset, decision: JsonObject) -> None:
         """Pass a decision to the operator and to the feed of the asset, and record its alarms.
 
         A notice before the first step has no control, and does not become the last decision.
         """
         if "control" in decision:
             asset.decision = decision
-        self._tell(asset, decision)
+        self._receive_decision(asset, decision)
         asset.feed.send_decision(decision)
         for notice in decision["notices"]:
             if notice["kind"] == "alarm":
                 asset.alarms.add(notice["sentence"])
 
-    def ask(self) -> None:
+    def request_end(self) -> None:
         """Request the end of the watch after the present step."""
         self.is_end_requested = True
 
@@ -338,7 +346,7 @@ class FleetWatch:
         """Return whether an asset has reached the requested number of steps."""
         return self._wanted_steps is not None and asset.watch.twin.steps >= self._wanted_steps
 
-    def lose(self, key: str, error: Exception) -> None:
+    def interrupt(self, key: str, error: Exception) -> None:
         """Interrupt the watch of an asset because of an error, and release its folder.
 
         The watch is resumed after a time. If the same error comes again, this time doubles and the
@@ -355,26 +363,26 @@ class FleetWatch:
             sentence = str(error)
         else:
             sentence = f"{type(error).__name__}: {error}"
-        wait = AGAIN_SECONDS
-        previous_loss = self._lost.get(key)
-        if previous_loss is not None and previous_loss.sentence == sentence:
-            wait = min(2.0 * previous_loss.wait, LONGEST_AGAIN)
+        wait = FIRST_WAIT_SECONDS
+        previous = self._interruptions.get(key)
+        if previous is not None and previous.sentence == sentence:
+            wait = min(2.0 * previous.wait, LONGEST_WAIT_SECONDS)
         else:
             self.note(f"{key} is not watched: {sentence}")
-        self._lost[key] = _Loss(sentence, wait, time.monotonic() + wait)
+        self._interruptions[key] = _Interruption(sentence, wait, time.monotonic() + wait)
         asset = self.assets.pop(key, None)
         if asset is not None:
-            self._records_of_lost[key] = asset.record()
+            self._records_of_interrupted[key] = asset.record()
             asset.close()
 
     def _write_state(self) -> None:
-        """Write the records of all assets to the file that `read_standing` reads."""
+        """Write the records of all assets to the file that `read_watched_state` reads."""
         records = {name: asset.record() for name, asset in sorted(self.assets.items())}
-        self.standing = {
-            "assets": {**self._records_of_lost, **records},
+        self.state = {
+            "assets": {**self._records_of_interrupted, **records},
             "failures": self.failures,
         }
-        atomic_write_text(self.folder / STATE_NAME, json.dumps(self.standing) + "\n")
+        atomic_write_text(self.folder / STATE_NAME, json.dumps(self.state) + "\n")
 
 
 def _check_observed(fleet: Fleet) -> None:
