@@ -1,7 +1,7 @@
 """The verdict and what it rests on, as records; its proof has a module of its own."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from math import nan
 
@@ -231,6 +231,11 @@ class ForceMoment:
     """Speed of the port [m/s or rad/s]."""
 
 
+def as_noun(variable: str) -> str:
+    """Return the name of a variable that a force may follow with its article."""
+    return variable if variable.startswith("the ") else f"the {variable}"
+
+
 @dataclass(frozen=True)
 class ForceAtPort:
     """The force that the model lacks at a port, as it is seen in the fitted trials."""
@@ -274,6 +279,11 @@ class ForceAtPort:
     """The same in held-out trials."""
 
     @property
+    def noun(self) -> str:
+        """What is missing: a force, a moment or, at a port of a state, a flow."""
+        return {"N": "force", "N m": "moment", "N or N m": "force"}.get(self.unit, "flow")
+
+    @property
     def followed_percent(self) -> str:
         """The largest fraction of the force's variance that follows one variable, in %."""
         return f"{100.0 * max(self.orders.values()):.0f}"
@@ -282,8 +292,9 @@ class ForceAtPort:
     def dependence(self) -> str:
         """What the force depends on, as a clause of a sentence."""
         if not self.ordered_by:
-            return f"it follows none of {listing(self.orders)}"
-        clause = f"{self.followed_percent} % of its variance follows {listing(self.ordered_by)}"
+            return f"it follows none of {listing(map(as_noun, self.orders))}"
+        followed = listing(map(as_noun, self.ordered_by))
+        clause = f"{self.followed_percent} % of its variance follows {followed}"
         if len(self.ordered_by) == 1 and self.ordered_by[0].startswith(RATE_OF):
             return f"{clause}, as if it acted later or earlier than was recorded"
         return clause
@@ -444,6 +455,17 @@ class Verdict:
     sensors: tuple[SensorEstimate, ...] = ()
     """Gains of the channels, and their zeros in each fitted trial, beside the named effects;
     without an effect if none is named."""
+    reasons: str = ""
+    """What the conclusion rests on, what it leaves and what it does not exclude, in sentences."""
+
+    @property
+    def text(self) -> str:
+        """The conclusion together with its reasons."""
+        return f"{self.sentence} {self.reasons}".strip()
+
+    def with_reasons(self, sentences: str) -> "Verdict":
+        """Return the verdict with further sentences after its reasons."""
+        return replace(self, reasons=f"{self.reasons} {sentences}".strip())
 
     def __repr__(self) -> str:
         effects = [effect.identifier for effect in self.effects]
@@ -465,4 +487,4 @@ class Verdict:
                 ]
                 rows.append(row)
         headings = ("effect", "place", "parameter", "value", "90 % interval", "unit")
-        return html_table(self.sentence, headings if rows else (), rows, self.remarks)
+        return html_table(self.text, headings if rows else (), rows, self.remarks)

@@ -37,7 +37,7 @@ from discrepancy.judgement.remarks import (
     KINDS_WITH_NAME,
     KINDS_WITHOUT_GAP,
     look_alike_remark,
-    sentence_with_times,
+    verdict_with_times,
     verdict_with_untested_effects,
 )
 from discrepancy.judgement.sensor_estimates import sensor_estimates
@@ -229,8 +229,7 @@ def investigate(
         with stages.stage("Looking for the next experiment", "next"):
             experiments = next_experiments(problem, comparison_of(search).open_hypotheses())
     verdict = replace(
-        verdict,
-        sentence=sentence_with_times(verdict, windows),
+        verdict_with_times(verdict, windows),
         remarks=tuple(remarks),
         next_experiments=experiments,
         not_fitted=effects_not_fitted(problem.setting, catalogue, search),

@@ -16,6 +16,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
+from textwrap import fill
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -86,9 +87,13 @@ def console() -> "Console":
     """
     from rich.console import Console
 
-    has_width = sys.stdout.isatty() or "COLUMNS" in os.environ
-    width = None if has_width else WIDTH_OF_A_PIPE
+    width = None if _has_width() else WIDTH_OF_A_PIPE
     return Console(highlight=False, markup=False, width=width, quiet=loudness.quiet)
+
+
+def _has_width() -> bool:
+    """Return whether results go to a terminal, or to a pipe with a width by COLUMNS."""
+    return sys.stdout.isatty() or "COLUMNS" in os.environ
 
 
 def say(text: str, *, fg: str | None = None, bold: bool | None = None) -> None:
@@ -108,12 +113,24 @@ def say(text: str, *, fg: str | None = None, bold: bool | None = None) -> None:
 
 
 def show(blocks: "Iterable[str | TextTable]") -> None:
-    """Print the lines and tables of a result in their order; tables without rows are left out."""
+    """Print the paragraphs and tables of a result in their order, without tables that are empty.
+
+    A paragraph is broken between words where it is wider than the terminal.
+    """
     for block in blocks:
         if isinstance(block, str):
-            say(block)
+            say(_fitted_to_terminal(block) if _has_width() else block)
         elif block.rows:
             print_table([column.name for column in block.columns], block.rows)
+
+
+def _fitted_to_terminal(text: str) -> str:
+    """Return a text whose lines are broken between words at the width of the terminal."""
+    width = console().width
+    lines = []
+    for line in text.splitlines():
+        lines.append(fill(line, width, break_long_words=False, break_on_hyphens=False))
+    return "\n".join(lines)
 
 
 def print_table(

@@ -6,7 +6,7 @@ import sys
 import uav_twin
 from benchmarks.pictures.notebooks import folder_until_exit
 from benchmarks.pictures.picture import Drawing
-from discrepancy.report.figures import missing_force_figure
+from discrepancy.report.force_figure import missing_force_figure
 from reporting.pages.figures import publication_style, to_png
 
 CHAIN = "three_mass_chain"

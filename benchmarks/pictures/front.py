@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 
 from benchmarks.pictures.notebooks import notebook
 from benchmarks.pictures.picture import Drawing
-from discrepancy.report.figures import missing_force_figure
+from discrepancy.report.force_figure import missing_force_figure
 from reporting.pages.figures import (
     PAST,
     PREDICTION,

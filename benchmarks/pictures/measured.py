@@ -11,7 +11,7 @@ from benchmarks.pictures.picture import Drawing
 from benchmarks.public_rigs.__main__ import write as write_public_rig
 from discrepancy.campaign.records import Trial
 from discrepancy.fits.problem import Problem
-from discrepancy.report.figures import missing_force_figure
+from discrepancy.report.force_figure import missing_force_figure
 from discrepancy.sources.measured_rigs import write_rig_campaign
 from discrepancy.workflow import Investigation
 from evidence.sandwich_plate.plate_comparison import DAMAGE, PlateAgreement, compare_with_plate

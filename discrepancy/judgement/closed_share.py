@@ -184,32 +184,41 @@ def compared_trials_text(share: ClosedShare) -> str:
     return f"{counted(share.trial_count, 'trial')} that were {role}"
 
 
+def channels_by_error(channels: Mapping[str, Channel], rms: Mapping[str, float]) -> list[str]:
+    """Return the `CHANNELS_MENTIONED` channels with the largest rms error over noise, in order."""
+    names = sorted(
+        rms, key=lambda name: -rms[name] / _recorded_noise_or_fallback(channels[name], rms[name])
+    )
+    return names[:CHANNELS_MENTIONED]
+
+
+def error_change_text(
+    channels: Mapping[str, Channel],
+    name: str,
+    rms_before: Mapping[str, float],
+    rms_after: Mapping[str, float],
+) -> str:
+    """Return the rms error of a channel before and after in its unit, as in "3.6 → 0.95 mm"."""
+    factor, unit = UNITS[channels[name].quantity].drawn
+    change = f"{factor * rms_before[name]:.3g} → {factor * rms_after.get(name, nan):.3g}"
+    return f"{change} {unit}" if unit != NOMINAL_UNIT else f"{change} in its own unit"
+
+
 def rms_errors_text(
     channels: Mapping[str, Channel], rms_before: Mapping[str, float], rms_after: Mapping[str, float]
 ) -> str:
-    """Return rms errors before and after in the units of their channels, as in "x 3.6 to 0.95 mm".
-
-    The `CHANNELS_MENTIONED` channels with the largest error over noise before are mentioned.
+    """Return rms errors before and after in the units of their channels, as in "x 3.6 → 0.95 mm".
 
     Parameters
     ----------
     rms_before, rms_after : mapping of str to float
         The rms error of each channel without and with the hypothesis [unit of the channel].
     """
-    # the largest error over its noise first
-    names = sorted(
-        rms_before,
-        key=lambda name: (
-            -rms_before[name] / _recorded_noise_or_fallback(channels[name], rms_before[name])
-        ),
-    )
     channel_texts = []
-    for name in names[:CHANNELS_MENTIONED]:
-        factor, unit = UNITS[channels[name].quantity].drawn
-        change = f"{factor * rms_before[name]:.3g} to {factor * rms_after.get(name, nan):.3g}"
-        change = f"{change} {unit}" if unit != NOMINAL_UNIT else f"{change} in its own unit"
+    for name in channels_by_error(channels, rms_before):
+        change = error_change_text(channels, name, rms_before, rms_after)
         channel_texts.append(f"{name} {change}")
-    unmentioned_count = len(names) - CHANNELS_MENTIONED
+    unmentioned_count = len(rms_before) - CHANNELS_MENTIONED
     if unmentioned_count > 0:
         channel_texts.append(f"{unmentioned_count} more in the report")
     return ", ".join(channel_texts)

@@ -30,6 +30,7 @@ from discrepancy.verdict import Gate
 from reporting.probabilities import normalised_probabilities, probability_of_some
 
 from .closed_share import closed_share_text
+from .hypotheses import UNEXPLAINED_GAP
 from .proof import errors_of_fit
 
 CONTRADICTING_SHARE = -0.1
@@ -88,9 +89,9 @@ class Comparison(ABC, Generic[HypothesisT]):
     def ranked_hypotheses(self) -> Sequence[HypothesisT]:
         """All hypotheses, the most probable first."""
 
-    @abstractmethod
     def gap_sentence(self) -> str:
-        """Return a sentence that describes the gap; empty if nothing is known of it."""
+        """Return the sentence on a gap that no effect explains."""
+        return UNEXPLAINED_GAP
 
     @abstractmethod
     def _compute_gap_share(self, hypothesis: HypothesisT, *, held_out: bool) -> GapShare:

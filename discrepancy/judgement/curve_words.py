@@ -4,6 +4,7 @@ A force counts positive against the motion, as that of a spring.
 """
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 
@@ -19,6 +20,9 @@ LEAST_DEAD_BAND = 0.15
 STEADY_SLOPE = 0.5
 """Slope next to a stretch without force over the slope at the end of the range, from which on the
 force rises like that of a spring with play."""
+STRAIGHT, LEAST_STRAIGHT = 0.05, 0.4
+"""Largest difference of a force from a straight line, over that at its end, where it counts as
+straight; and least length of such a stretch, as a fraction of the range."""
 ONE_SIDED = 0.2
 """Largest force on one side over that on the other, up to which the force acts on one side only."""
 PEAK_OVER_END = 1.2
@@ -58,8 +62,19 @@ def curve_in_words(curve: TableStiffness | TableDamping, force_unit: str) -> str
         return _friction_in_words(np.array(curve.speeds), forces, force_unit, f"{motion_unit}/s")
     points = np.array(curve.displacements)
     dead_band = _stretch_without_force(points, forces)
+    line_text = ""
     if dead_band is None:
-        return _growth("displacement", points, forces)
+        # an error of the stiffness adds a line to a force with a stretch without force
+        line = _line_of_longest_stretch(points, forces)
+        if line is not None:
+            dead_band = _stretch_without_force(points, forces - line.force_at(points))
+            forces = forces if dead_band is None else forces - line.force_at(points)
+            line_text = (
+                f"apart from a line of {number(line.slope)} {force_unit}/{motion_unit}, as an "
+                "error of the stiffness gives, "
+            )
+    if dead_band is None:
+        return _growth("displacement", points, forces, force_unit, motion_unit)
     low, high = dead_band
     slopes = []
     is_below, is_above = points <= low, points >= high
@@ -76,9 +91,38 @@ def curve_in_words(curve: TableStiffness | TableDamping, force_unit: str) -> str
         slope, high = _line_to_zero(points, forces, is_above)
         slopes.append(f"{number(slope)} {force_unit}/{motion_unit} above")
     if low >= high:  # the forces beyond the stretch are no lines that begin at its ends
-        return _growth("displacement", points, forces)
+        return _growth("displacement", points, forces, force_unit, motion_unit)
     begin, end = _position_text(low, motion_unit), _position_text(high, motion_unit)
-    return f"it is zero from {begin} to {end}, with a slope of {listing(slopes)}"
+    return f"{line_text}it is zero from {begin} to {end}, with a slope of {listing(slopes)}"
+
+
+class _Line(NamedTuple):
+    """A straight line: a force with its slope."""
+
+    slope: float
+    at_zero: float
+
+    def force_at(self, displacements: FloatArray) -> FloatArray:
+        """Return the force (N,) of the line at displacements (N,)."""
+        return self.at_zero + self.slope * displacements
+
+
+def _line_of_longest_stretch(displacements: FloatArray, forces: FloatArray) -> _Line | None:
+    """Return the line that a force follows on the longest stretch of displacements.
+
+    A force follows a line if it differs by at most `STRAIGHT` of the largest difference anywhere.
+    None if the longest such stretch is shorter than `LEAST_STRAIGHT` of the range.
+    """
+    count = len(displacements)
+    for length in range(count - 1, int(LEAST_STRAIGHT * count), -1):
+        for first in range(count - length + 1):
+            stretch = slice(first, first + length)
+            slope, at_zero = np.polyfit(displacements[stretch], forces[stretch], 1)
+            line = _Line(float(slope), float(at_zero))
+            difference = np.abs(forces - line.force_at(displacements))
+            if difference[stretch].max() <= STRAIGHT * difference.max():
+                return line
+    return None
 
 
 def _position_text(position: float, unit: str) -> str:
@@ -97,7 +141,7 @@ def _friction_in_words(
         resistances.append(direction * forces[is_in_direction][ascending])
     count = min(len(resistance) for resistance in resistances)
     if count < LEAST_POINTS_OF_FRICTION:
-        return _growth("velocity", velocities, forces)
+        return _growth("velocity", velocities, forces, force_unit, velocity_unit)
     # The mean of both directions, from the slowest points to the fastest. The k-th slowest points
     # of both are taken as a pair: their speeds are nearly equal if both ranges of velocity are.
     mean_resistance = 0.5 * (resistances[0][:count] + resistances[1][:count])
@@ -108,7 +152,7 @@ def _friction_in_words(
             f"it is largest near rest, and falls to {number(float(mean_resistance[-1]))} "
             f"{force_unit} at {number(float(speeds[-1]))} {velocity_unit}"
         )
-    return _growth("velocity", velocities, forces)
+    return _growth("velocity", velocities, forces, force_unit, velocity_unit)
 
 
 def _line_to_zero(
@@ -148,14 +192,16 @@ def _stretch_without_force(
     return low, high
 
 
-def _growth(variable: str, motion: FloatArray, forces: FloatArray) -> str:
-    """Return in words how a force grows with the motion, and whether it acts on one side only.
+def _growth(
+    variable: str, motion: FloatArray, forces: FloatArray, force_unit: str, motion_unit: str
+) -> str:
+    """Return in words how a force grows with the motion, how far, and whether on one side only.
 
     `variable` says whether the motion is a displacement or a velocity.
     """
     changes = forces - float(np.interp(0.0, motion, forces))
     largest_by_side = {}
-    for side in (-1.0, 1.0):
+    for side in (1.0, -1.0):
         changes_on_side = np.where(side * motion > 0.0, changes, 0.0)
         largest_by_side[side] = float(np.abs(changes_on_side).max())
     stronger = max(largest_by_side, key=lambda side: largest_by_side[side])
@@ -168,15 +214,22 @@ def _growth(variable: str, motion: FloatArray, forces: FloatArray) -> str:
     exponent = float(np.polyfit(log_motion, log_force, 1, w=weights)[0])
     largest = int(np.argmax(np.where(on_side, np.abs(changes), 0.0)))
     acts_against = changes[largest] * motion[largest] > 0.0
+    largest_force = f"{number(float(np.abs(changes[largest])))} {force_unit}"
+    end = _position_text(float(motion[largest]), motion_unit)
     if exponent < CONSTANT_EXPONENT:
-        growth = "it is nearly constant"
+        growth = f"it is nearly constant, at most {largest_force}"
     elif exponent < LINEAR_EXPONENT:
-        growth = f"it grows in proportion to the {variable}"
+        slope = float(np.dot(changes, motion) / np.dot(motion, motion))
+        slope_unit = f"{force_unit}/{f'({motion_unit})' if '/' in motion_unit else motion_unit}"
+        growth = f"it is proportional to the {variable}, {number(slope)} {slope_unit}"
     else:
         verb = "stiffens" if acts_against else "softens"
-        begin = f"it {verb}, growing" if variable == "displacement" else "it grows"
-        growth = f"{begin} about as the power {exponent:.2g} of the {variable}"
+        begin = f"it {verb}" if variable == "displacement" else "it grows"
+        power = f"about as the power {exponent:.2g} of the {variable}"
+        growth = f"{begin} by {largest_force} at {end}, {power}"
+        if variable == "velocity":
+            growth = f"{begin} to {largest_force} at {end}, {power}"
     side_text = "positive" if stronger > 0.0 else "negative"
     plural = "displacements" if variable == "displacement" else "velocities"
-    where = f" at {side_text} {plural} only" if is_one_sided else ""
+    where = f", at {side_text} {plural} only" if is_one_sided else ""
     return f"{growth}{where}"

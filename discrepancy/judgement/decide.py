@@ -18,9 +18,10 @@ from discrepancy.verdict import Verdict, VerdictKind
 
 from .comparison import Comparison, HypothesisT
 from .force_comparison import ForceComparison
-from .hypotheses import VerdictOutcome
+from .hypotheses import VerdictOutcome, is_gain_error
 from .instrument_errors import notable_terms, verdict_rejecting_instruments
 from .moved_unknowns import (
+    GAIN_OF,
     hiding_sentences,
     moved_sentence,
     moved_unknowns,
@@ -70,14 +71,12 @@ def reach_verdict(
         sensors = sensor_estimates(problem, no_effect)
         sentences = hiding_sentences(moved, moved_within_prior, sensors)
     else:
-        sentences = moved_sentence(moved)
-    verdict = replace(
-        verdict,
-        sentence=f"{verdict.sentence} {sentences}".strip(),
-        moved=moved,
-        moved_within_prior=moved_within_prior,
-    )
-    return outcome._replace(verdict=verdict)
+        named_gains = {
+            f"{GAIN_OF}{effect.place}" for effect in verdict.effects if is_gain_error(effect)
+        }
+        sentences = moved_sentence([item for item in moved if item.name not in named_gains])
+    verdict = replace(verdict, moved=moved, moved_within_prior=moved_within_prior)
+    return outcome._replace(verdict=verdict.with_reasons(sentences))
 
 
 def comparison_of(search: Search) -> ForceComparison | SimulationComparison:
@@ -130,10 +129,9 @@ def _with_test_on_held_out(
     if fit.residual_process is not None:  # a χ² against the recorded noise alone
         fit = replace(fit, residual_process=None)
     gate = check_held_out(comparison.search.residuals(fit))
-    sentence = f"{verdict.sentence} {gate.reason}" if gate.has_failed else verdict.sentence
-    return outcome._replace(
-        verdict=replace(verdict, sentence=sentence, gates=(*verdict.gates, gate))
-    )
+    if gate.has_failed:
+        verdict = verdict.with_reasons(gate.reason)
+    return outcome._replace(verdict=replace(verdict, gates=(*verdict.gates, gate)))
 
 
 def _leaves_more_than_noise(verdict: Verdict) -> bool:

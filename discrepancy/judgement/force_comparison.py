@@ -160,11 +160,11 @@ class ForceComparison(Comparison[Estimate]):
         return force_unit
 
     def gap_sentence(self) -> str:
-        """Return a sentence on the size and port of the missing force, and on what it depends."""
+        """Return the sentence on a gap that no effect explains: its force, if one was found."""
         if self._missing_force is None:
-            return ""
+            return super().gap_sentence()
         force = self._missing_force.at_port
         return (
-            f"A force of {force.rms:.3g} {force.unit} (rms) is missing at {force.port!r}; "
-            f"{force.dependence}."
+            f"A {force.noun} of {force.rms:.3g} {force.unit} (rms) is missing at {force.port}, and "
+            f"no law of the catalogue explains it: {force.dependence}."
         )

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
-from math import isnan, nan
+from math import isfinite, isnan, nan
 from typing import NamedTuple
 
 import numpy as np
@@ -27,10 +27,13 @@ from discrepancy.verdict import (
     RemainderEstimate,
     Verdict,
 )
-from reporting.words import listing
+from fe.runtime.patch import SensorGain
+from reporting.words import between, listing, rounded
 
 from .curve_words import curve_in_words, curve_of, followed_variable
 
+UNEXPLAINED_GAP = "Something is missing that no effect of the catalogue explains."
+"""The conclusion on a gap of which neither a law nor a force is known."""
 POINT_STRIDE = 6
 """A verdict lists every sixth point of a table of forces."""
 
@@ -315,6 +318,60 @@ def effects_text(effects: Iterable[NamedEffect]) -> str:
             text = f"a law of the family {effect.family} ({shape})"
         texts.append(f"{text} at {effect.place}" if effect.place else text)
     return listing(dict.fromkeys(texts))
+
+
+def missing_clause(effects: Sequence[NamedEffect]) -> str:
+    """Return a clause on the effects that the model lacks, and the sensors with a wrong gain.
+
+    It is such as "the model lacks friction at slide and the channel g1 shows 3.1 % (2.8 to 3.4) too
+    much", with a 90 % interval in brackets.
+    """
+    clauses = []
+    lacking_effects = [effect for effect in effects if not is_gain_error(effect)]
+    if lacking_effects:
+        clauses.append(f"the model lacks {effects_text(lacking_effects)}")
+    for effect in effects:
+        if is_gain_error(effect):
+            clauses.append(gain_error_text(effect.place, effect.parameters[0]))
+    return listing(clauses)
+
+
+def group_sentence(effects_by_member: Iterable[Sequence[NamedEffect]], probability: float) -> str:
+    """Return the sentence that one of several sets of effects explains what is missing.
+
+    Parameters
+    ----------
+    effects_by_member : iterable of sequence of NamedEffect
+        The effects of each set, the most probable one first.
+    probability : float
+        The probability that one of them does.
+    """
+    members = [*effects_by_member]
+    explanation = f"Either {listing(map(missing_clause, members), 'or')}"
+    if not any(is_gain_error(effect) for effects in members for effect in effects):
+        explanation = f"The model lacks either {listing(map(effects_text, members), 'or')}"
+    return (
+        f"{explanation} (probability {probability_text(probability)}): these data cannot tell "
+        "which."
+    )
+
+
+def is_gain_error(effect: NamedEffect) -> bool:
+    """Return whether an effect is a wrong gain of one channel."""
+    primitives = [*effect.patch]
+    return len(primitives) == 1 and isinstance(primitives[0], SensorGain) and bool(effect.place)
+
+
+def gain_error_text(channel: str, gain: ParameterEstimate) -> str:
+    """Return how much too much or too little a channel shows, in percent with its 90 % interval."""
+    magnitude = 100.0 * abs(gain.value)
+    low, high = sorted((100.0 * abs(gain.low), 100.0 * abs(gain.high)))
+    half_width = 50.0 * (gain.high - gain.low)
+    interval = ""
+    if isfinite(half_width) and gain.low * gain.high > 0.0:
+        interval = f" ({between(low, high, half_width)})"
+    side = "much" if gain.value > 0.0 else "little"
+    return f"the channel {channel} shows {rounded(magnitude, half_width)} %{interval} too {side}"
 
 
 def probability_text(probability: float) -> str:

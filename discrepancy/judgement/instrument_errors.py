@@ -126,10 +126,12 @@ def verdict_rejecting_instruments(
         )
         source = "the mesh" if problem.model.nuisance_parameters else "the instruments"
         sentence = (
-            f"The model explains the data except for {causes} below {100.0 * limit:g} % of the "
-            f"quantity; an error that small counts as a nuisance of {source}, and is not named."
+            f"Nothing is missing but {causes} below {100.0 * limit:g} % of the quantity, which is "
+            f"an ordinary error of {source} and is not named."
         )
-        return replace(without_name, kind=VerdictKind.NOTHING_MISSING, sentence=sentence)
+        return replace(
+            without_name, kind=VerdictKind.NOTHING_MISSING, sentence=sentence, reasons=""
+        )
     # reason 2: a gain that only keeps calibrated parameters within their priors
     if not has_one_driven_channel(problem) or not problem.campaign.held_out:
         return None
@@ -139,13 +141,19 @@ def verdict_rejecting_instruments(
         return None
     sentence = (
         "The model predicts held-out trials as it is, but with calibrated parameters outside "
-        f"their priors{_implausible_parameters_clause(search)}. An error of the instruments "
-        f"({causes}) would explain them as well: with one channel, these data cannot distinguish "
-        "the two."
+        f"the range that was stated{_implausible_parameters_clause(search)}."
+    )
+    reasons = (
+        f"An error of the instruments ({causes}) would explain the readings as well: with one "
+        "channel, these data cannot distinguish the two."
     )
     resembles = tuple(dict.fromkeys(effect.identifier for effect in verdict.effects))
     return replace(
-        without_name, kind=VerdictKind.UNEXPLAINED, sentence=sentence, resembles=resembles
+        without_name,
+        kind=VerdictKind.UNEXPLAINED,
+        sentence=sentence,
+        reasons=reasons,
+        resembles=resembles,
     )
 
 

@@ -33,6 +33,11 @@ for a zero, below which a prior is not called wide: too little for an error of t
 LEAST_SIGNIFICANCE = 3.0
 """Distance from the stated value, in posterior deviations, from which the data show that an unknown
 has moved."""
+DRAWN_UNITS = {
+    UNITS[quantity].si: UNITS[quantity].drawn
+    for quantity in (Quantity.STRAIN, Quantity.DISPLACEMENT)
+}
+"""Factor and unit in which zeros are told, by their SI unit."""
 MOST_MENTIONED = 5
 """Number of moved unknowns that a sentence mentions."""
 
@@ -228,7 +233,7 @@ def moved_sentence(unknowns: Sequence[MovedUnknown]) -> str:
     """Return a sentence on the unknowns that the fit without effect moves; empty if none."""
     if not unknowns:
         return ""
-    return f"Fitted without an effect, the model moves {_moved_texts(unknowns)}."
+    return f"Without an effect, the fit moves {_moved_texts(unknowns)}."
 
 
 def hiding_sentences(
@@ -262,19 +267,15 @@ def hiding_sentences(
     sentences = []
     if moved_gains:
         gain_texts = listing(map(_gain_text, moved_gains), most=MOST_MENTIONED)
-        sentences.append(
-            f"Fitted without an effect, {gain_texts}, where an error of the model may hide."
-        )
+        sentences.append(f"In the fit {gain_texts}: an error of the model may hide there.")
     if other_unknowns:
         sentences.append(
-            f"Fitted without an effect, the model moves {_moved_texts(other_unknowns)}, where an "
-            "error of the model may hide."
+            f"The fit moves {_moved_texts(other_unknowns)}: an error of the model may hide there."
         )
     if moved_within_prior:
         sentences.append(
-            "Within wide stated deviations the model without an effect moves "
-            f"{_moved_texts(moved_within_prior)}: an error of the model of this size would not "
-            "show."
+            f"Within wide stated deviations the fit moves {_moved_texts(moved_within_prior)}: an "
+            "error of the model of this size would not show."
         )
     return " ".join(sentences)
 
@@ -284,8 +285,8 @@ def _gain_text(gain: SensorEstimate) -> str:
     side = "much" if gain.value > 0.0 else "little"
     error = plus_minus(100.0 * abs(gain.value), 100.0 * gain.deviation)
     return (
-        f"{gain.channel} shows {error} % too {side}; stated was "
-        f"{100.0 * gain.stated_deviation:.3g} % ({abs(gain.deviations):.1f} deviations)"
+        f"the channel {gain.channel} shows {error} % too {side} (stated to "
+        f"{100.0 * gain.stated_deviation:.3g} %; {abs(gain.deviations):.1f} deviations)"
     )
 
 
@@ -314,10 +315,10 @@ def _moved_text(unknown: MovedUnknown) -> str:
         return f"the {name} by {100.0 * value:+.3g} % ({stated_text}; {distance_text})"
     if unknown.stated == 0.0:
         factor = 1.0
-        if name.startswith(ZERO_OF) and unknown.unit == UNITS[Quantity.STRAIN].si:
-            factor, strain_unit = UNITS[Quantity.STRAIN].drawn
-            unit = f" {strain_unit}"
+        if name.startswith(ZERO_OF) and unknown.unit in DRAWN_UNITS:
+            factor, drawn_unit = DRAWN_UNITS[unknown.unit]
+            unit = f" {drawn_unit}"
         stated_text = f"stated to {factor * stated_deviation:.3g}{unit}"
         return f"the {name} to {factor * value:.3g}{unit} ({stated_text}; {distance_text})"
     stated_text = f"{unknown.stated:.4g} ± {stated_deviation:.2g}"
-    return f"{name!r} from {stated_text} to {value:.4g}{unit} ({distance_text})"
+    return f"{name} from {stated_text} to {value:.4g}{unit} ({distance_text})"

@@ -193,6 +193,7 @@ class NoiseCase(Generic[HypothesisT]):
         family: str = "",
         gates: tuple[Gate, ...] = (),
         resembles: tuple[str, ...] = (),
+        reasons: str = "",
     ) -> VerdictOutcome:
         """Return a verdict together with all sets of effects and their probabilities.
 
@@ -205,10 +206,10 @@ class NoiseCase(Generic[HypothesisT]):
             The kind of conclusion, the sentence that the user reads, and its probability.
         fit : CandidateFit, optional
             The fit that represents the verdict. Without it, the fit without any effect is taken.
-        effects, group, family, gates, resembles
+        effects, group, family, gates, resembles, reasons
             The named effects; the effects that the data cannot tell apart; the family of a law of
-            free shape; the tests; the effects that an unexplained remainder resembles. See
-            `Verdict`.
+            free shape; the tests; the effects that an unexplained remainder resembles; further
+            sentences. See `Verdict`.
         """
         verdict = Verdict(
             kind,
@@ -220,6 +221,7 @@ class NoiseCase(Generic[HypothesisT]):
             family=family,
             gates=gates,
             resembles=resembles,
+            reasons=reasons,
         )
         weighted_hypotheses = []
         for names, set_probability in self.probabilities.items():
@@ -229,7 +231,12 @@ class NoiseCase(Generic[HypothesisT]):
         return outcome_with_hypotheses(verdict, self.comparison.search, fit, weighted_hypotheses)
 
     def unexplained(
-        self, sentence: str, probability: float, gates: tuple[Gate, ...], names: EffectSet
+        self,
+        sentence: str,
+        reasons: str,
+        probability: float,
+        gates: tuple[Gate, ...],
+        names: EffectSet,
     ) -> VerdictOutcome:
         """Return the verdict of an unexplained gap, which resembles a set of effects."""
         return self.outcome(
@@ -238,4 +245,5 @@ class NoiseCase(Generic[HypothesisT]):
             probability,
             gates=gates,
             resembles=names_without_free_shape(names),
+            reasons=reasons,
         )

@@ -13,18 +13,23 @@ from discrepancy.fits.predictive import with_draws
 from discrepancy.search_settings import SEARCH
 from discrepancy.verdict import Gate, NamedEffect, VerdictKind
 from reporting.probabilities import total_probability
-from reporting.words import listing
+from reporting.words import capital, listing, small
 
 from .comparison import EffectSet, HypothesisT
 from .hypotheses import (
     VerdictOutcome,
     curve_sentence,
     effects_text,
+    group_sentence,
+    missing_clause,
     named_effects,
     names_without_free_shape,
     probability_text,
 )
 from .noise_case import CheckedFit, NoiseCase
+
+MOST_NEAREST = 4
+"""Largest number of explanations that a verdict on a gap too small to be detected mentions."""
 
 
 def decide_on_noise(case: NoiseCase[HypothesisT]) -> VerdictOutcome:
@@ -60,30 +65,32 @@ def decide_on_noise(case: NoiseCase[HypothesisT]) -> VerdictOutcome:
 
 def gap_verdict(case: NoiseCase[HypothesisT]) -> VerdictOutcome:
     """Return the verdict that there is a gap which no effect of the catalogue explains."""
-    sentence = (
-        f"There is a gap that no effect of the catalogue explains. {case.no_effect_gate.reason}"
-    )
     return case.unexplained(
-        sentence, case.probabilities[case.leading_set], (case.no_effect_gate,), case.leading_set
+        case.comparison.gap_sentence(),
+        case.no_effect_gate.reason,
+        case.probabilities[case.leading_set],
+        (case.no_effect_gate,),
+        case.leading_set,
     )
 
 
 def nothing_missing_verdict(case: NoiseCase[HypothesisT]) -> VerdictOutcome:
     """Return the verdict that nothing is missing."""
+    reasons = ""
     if case.noise:
-        sentence = f"The model explains the data within their noise, {case.noise}."
+        explanation = f"the model explains the data within their noise, {case.noise}"
     elif case.no_effect_gate.passed:
-        sentence = "The model explains the data within their noise."
+        explanation = "the model explains the data within their noise"
     else:
-        sentence = (
-            "No effect of the catalogue explains the data better than the model does. "
-            f"{case.no_effect_gate.reason}"
-        )
+        explanation = "no effect of the catalogue explains the data better than the model does"
+        reasons = case.no_effect_gate.reason
+    probability = probability_text(case.no_effect_probability)
     return case.outcome(
         VerdictKind.NOTHING_MISSING,
-        sentence,
+        f"Nothing is missing (probability {probability}): {explanation}.",
         case.no_effect_probability,
         gates=(case.no_effect_gate,),
+        reasons=reasons,
     )
 
 
@@ -92,17 +99,15 @@ def named_verdict(case: NoiseCase[HypothesisT]) -> VerdictOutcome:
     fit = with_draws(case.problem, case.leading_fit)
     checked_fit = case.tested_set
     effects = named_effects(case.problem, fit)
-    probability_clause = f"probability {probability_text(case.probability)}"
-    sentence = f"The model lacks {effects_text(effects)} ({probability_clause})."
-    if not checked_fit.absolute_fit.passed:
-        sentence += f" {checked_fit.absolute_fit.reason}"
+    probability = probability_text(case.probability)
     return case.outcome(
         VerdictKind.NAMED,
-        sentence,
+        f"{capital(missing_clause(effects))} (probability {probability}).",
         case.probability,
         fit,
         effects=effects,
         gates=_gates(case, checked_fit),
+        reasons="" if checked_fit.absolute_fit.passed else checked_fit.absolute_fit.reason,
     )
 
 
@@ -155,20 +160,21 @@ def failed_test_verdict(case: NoiseCase[HypothesisT], checked_fit: CheckedFit) -
     reason = checked_fit.absolute_fit.reason
     if not checked_fit.absolute_fit.has_failed and checked_fit.consistency.has_failed:
         reason = checked_fit.consistency.reason
-    if case.leading_fit.candidate.has_free_shape:  # it has no nearest effect to mention
-        sentence = f"There is a gap that no effect of the catalogue fits. {reason}"
-    else:
+    if not case.leading_fit.candidate.has_free_shape:  # else it has no nearest effect to mention
         if case.needs_free_shape and case.tested_family_set is None:
             reason = (
                 "one of them would need a free shape, and with that much freedom nearly anything "
                 "fits."
             )
-        nearest_effects = " with ".join(case.leading_fit.candidate.identifiers)
-        sentence = (
-            "There is a gap that no effect of the catalogue fits; the nearest is "
-            f"{nearest_effects}, but {reason[0].lower()}{reason[1:]}"
-        )
-    return case.unexplained(sentence, case.probability, _gates(case, checked_fit), case.leading_set)
+        nearest_effects = effects_text(named_effects(case.problem, case.leading_fit))
+        reason = f"The nearest in the catalogue is {nearest_effects}, but {small(reason)}"
+    return case.unexplained(
+        case.comparison.gap_sentence(),
+        reason,
+        case.probability,
+        _gates(case, checked_fit),
+        case.leading_set,
+    )
 
 
 def _gates(case: NoiseCase[HypothesisT], checked_fit: CheckedFit) -> tuple[Gate, ...]:
@@ -245,13 +251,12 @@ def undecided_verdict(case: NoiseCase[HypothesisT]) -> VerdictOutcome:
     if group and len(group) <= SEARCH.largest_group:
         return _group_verdict(case, group, probability)
     most_probable = members[0]
-    sentence = (
-        f"There is a gap that no effect of the catalogue fits. {most_probable.absolute_fit.reason}"
-    )
+    reason = most_probable.absolute_fit.reason
     if group:
-        sentence = f"There is a gap, and {len(group)} explanations fit it equally well."
+        reason = f"{len(group)} explanations fit equally well."
     return case.unexplained(
-        sentence,
+        case.comparison.gap_sentence(),
+        reason,
         total_probability(case.probabilities[names] for names in case.probable_sets),
         (most_probable.absolute_fit,),
         most_probable.effect_names,
@@ -264,13 +269,14 @@ def _below_limit_verdict(case: NoiseCase[HypothesisT]) -> VerdictOutcome:
         {name for names in case.probable_sets for name in names_without_free_shape(names)}
     )
     noise_clause = f", {case.noise}" if case.noise else ""
-    nearest_clause = ""
-    if possible_effects:
-        nearest_clause = f"; the nearest are {', '.join(possible_effects[:4])}"
+    probability = probability_text(case.no_effect_probability)
     sentence = (
         "Something may be missing, but it is too small for these data to distinguish from noise"
-        f"{noise_clause}{nearest_clause}."
+        f"{noise_clause} (probability that nothing is missing {probability})."
     )
+    hypotheses = [case.comparison.best_of_set(names) for names in case.probable_sets]
+    texts = [effects_text(named_effects(case.problem, item)) for item in hypotheses]
+    nearest = listing(filter(None, texts), most=MOST_NEAREST)
     return case.outcome(
         VerdictKind.BELOW_LIMIT,
         sentence,
@@ -278,6 +284,7 @@ def _below_limit_verdict(case: NoiseCase[HypothesisT]) -> VerdictOutcome:
         case.leading_fit,
         group=tuple(possible_effects),
         gates=(check_absolute_fit(case.problem, case.leading_fit),),
+        reasons=f"The nearest in the catalogue: {nearest}." if nearest else "",
     )
 
 
@@ -291,15 +298,11 @@ def _group_verdict(
     """
     fits = [with_draws(case.problem, member.fit) for member in members]
     effects_by_member = [named_effects(case.problem, fit) for fit in fits]
-    names = listing([effects_text(effects) for effects in effects_by_member], "or")
-    if len(members) > 1:
+    sentence = group_sentence(effects_by_member, probability)
+    if len(members) == 1:
+        (names,) = map(effects_text, effects_by_member)
         sentence = (
-            f"Either {names} is missing (probability {probability_text(probability)}); these "
-            "data cannot tell which."
-        )
-    else:
-        sentence = (
-            f"There is a gap that {names} fits, but its probability of "
+            f"{capital(names)} fits the data, but its probability of "
             f"{probability_text(probability)} is less than a name needs."
         )
     all_effects: list[NamedEffect] = []

@@ -402,7 +402,10 @@ def _closed_share_or_reason(
     has_no_gap_before = chi_square_before.excess_over_noise < LEAST_EXCESS_DEVIATIONS
     if has_no_gap_before and chi_square_after.excess_over_noise <= HELD_OUT_DEVIATIONS:
         chi_square = f"χ² per sample {chi_square_before.per_sample:.3g}, 1 for noise alone"
-        return None, f"Held-out trials show no gap before: {chi_square}."
+        return None, (
+            "The held-out trials do not test it: the unchanged model predicts them within their "
+            f"noise ({chi_square})."
+        )
     return share, ""
 
 

@@ -22,6 +22,8 @@ from .hypotheses import (
     WeightedHypothesis,
     curve_sentence,
     effects_text,
+    group_sentence,
+    missing_clause,
     named_effects,
     names_without_free_shape,
     outcome_with_hypotheses,
@@ -95,29 +97,24 @@ def named_in_part_outcome(
     share = comparison.held_out_or_fitted_share(best_hypothesis)
     families = {term.effect.family for term in best_hypothesis.candidate.terms if term.free_shape}
     family = ", ".join(sorted(families))
-    # what is missing: effects of the catalogue, and families with a shape of their own
-    phrases = []
-    names_of_canonical = effects_text(effect for effect in effects if not effect.shape)
-    if names_of_canonical:
-        phrases.append(names_of_canonical)
-    if family:
-        phrases.append(f"an effect of the family {family}, with a fitted shape,")
-    # what it explains, and what remains
-    share_clause = comparison.closed_share_clause(best_hypothesis)
-    missing = curve_sentence(comparison.problem, effects, probability)
-    if missing:
-        sentence = f"{missing} {capital(share_clause)}."
-    else:
+    sentence = curve_sentence(comparison.problem, effects, probability)
+    if not sentence:
+        # effects of the catalogue, and families with a shape of their own
+        clauses = []
+        canonical_effects = [effect for effect in effects if not effect.shape]
+        if canonical_effects:
+            clauses.append(missing_clause(canonical_effects))
+        if family:
+            clauses.append(f"an effect of the family {family} is missing, with a fitted shape")
         sentence = (
-            f"{capital(listing(phrases))} is missing (probability "
-            f"{probability_text(probability)}): {share_clause}."
+            f"{capital(listing(clauses))} (probability {probability_text(probability)}), and a "
+            "part without a name."
         )
+    reasons = ""
     if comparison.has_held_out and not share.held_out:
-        sentence += " In the held-out trials it has hardly any force."
-    unexplained_text = comparison.unexplained_text(best_hypothesis, share)
-    sentence += f" It leaves {unexplained_text}, which is unexplained."
-    sentence += _shape_sentence(comparison, best_hypothesis)
-    sentence += _unproved_addition_sentence(comparison, best_hypothesis)
+        reasons = "In the held-out trials it has hardly any force."
+    reasons += _shape_sentence(comparison, best_hypothesis)
+    reasons += _unproved_addition_sentence(comparison, best_hypothesis)
     return _outcome(
         comparison,
         VerdictKind.NAMED_IN_PART,
@@ -128,6 +125,7 @@ def named_in_part_outcome(
         effects=effects,
         family=family,
         gates=(comparison.absolute_fit(best_hypothesis),),
+        reasons=reasons.strip(),
     )
 
 
@@ -209,18 +207,9 @@ def _group_outcome(
     """Return the verdict that one of several hypotheses is true, and the data do not show which.
 
     `members` are these hypotheses, the best one first, and `probability` is that of one of them
-    being true. If some effects are in all of them, the sentence first says that these are missing.
-    The gate in the verdict is that of the best one.
+    being true. The gate in the verdict is that of the best one.
     """
     effects_by_member = [named_effects(comparison.problem, member) for member in members]
-    sentence = _group_sentence(comparison, members, effects_by_member, probability)
-    common_pairs = frozenset.intersection(*(effect_place_pairs(member) for member in members))
-    common_effects = []
-    for effect in effects_by_member[0]:
-        if (effect.identifier, effect.place) in common_pairs:
-            common_effects.append(effect)
-    if common_effects:
-        sentence = f"{capital(effects_text(common_effects))} is missing. {sentence}"
     all_effects: list[NamedEffect] = []
     for effects in effects_by_member:
         all_effects.extend(effects)
@@ -231,7 +220,7 @@ def _group_outcome(
     return _outcome(
         comparison,
         VerdictKind.GROUP,
-        sentence,
+        group_sentence(effects_by_member, probability),
         # rounding may put the sum of the members' probabilities above one
         min(probability, 1.0),
         judged_hypothesis=members[0],
@@ -239,37 +228,33 @@ def _group_outcome(
         effects=tuple(all_effects),
         group=tuple(member_names),
         gates=(comparison.absolute_fit(members[0]),),
+        reasons=_sentences_on_members(comparison, members, effects_by_member),
     )
 
 
-def _group_sentence(
+def _sentences_on_members(
     comparison: Comparison[HypothesisT],
     members: Sequence[HypothesisT],
     effects_by_member: Sequence[Sequence[NamedEffect]],
-    probability: float,
 ) -> str:
-    """Return the sentence that lists the members of a group and the share that each explains.
-
-    The probability is that one of the members is true.
-    """
-    member_texts = []
-    for member, effects in zip(members, effects_by_member, strict=True):
-        member_share = comparison.errors(member).closed
-        share_in_brackets = ""
-        if member_share is not None:
-            share_in_brackets = f" ({percent_with_interval(member_share)})"
-        member_texts.append(f"{effects_text(effects)}{share_in_brackets}")
-    sentence = (
-        f"Either {listing(member_texts, 'or')} is missing (probability "
-        f"{probability_text(probability)}); these data cannot tell which."
-    )
-    best_share = comparison.errors(members[0]).closed
-    if best_share is None:
-        return f"{sentence} {capital(comparison.closed_share_clause(members[0]))}."
-    return (
-        f"{sentence} In brackets the share of the mean square error that each explains in "
-        f"{compared_trials_text(best_share)}."
-    )
+    """Return what all members of a group have in common, and the share that each explains."""
+    sentences = []
+    common_pairs = frozenset.intersection(*(effect_place_pairs(member) for member in members))
+    common_effects = []
+    for effect in effects_by_member[0]:
+        if (effect.identifier, effect.place) in common_pairs:
+            common_effects.append(effect)
+    if common_effects:
+        sentences.append(f"In each case {missing_clause(common_effects)}.")
+    shares = [comparison.errors(member).closed for member in members]
+    known_shares = [share for share in shares if share is not None]
+    if len(known_shares) == len(members):
+        texts = listing(map(percent_with_interval, known_shares))
+        trials = compared_trials_text(known_shares[0])
+        sentences.append(f"They explain {texts} of the mean square error in {trials}.")
+    else:
+        sentences.append(f"{capital(comparison.closed_share_clause(members[0]))}.")
+    return " ".join(sentences)
 
 
 # ---------------------------------------------------------------- an unexplained gap
@@ -297,7 +282,7 @@ def unexplained_outcome(
         The reason why it is not named. If left out, it is that of `Comparison.objection_to_naming`,
         or else that its probability is too low.
     """
-    gap_sentences = f"{_gap_text(noise_verdict)} {comparison.gap_sentence()}".strip()
+    failed_gates = [gate.reason for gate in noise_verdict.gates if gate.has_failed]
     mentioned_hypothesis = (
         _hypothesis_explaining_most(comparison)
         if considered_hypothesis is None
@@ -308,10 +293,11 @@ def unexplained_outcome(
     explained_share = 0.0
     if mentioned_hypothesis is not None:
         explained_share = comparison.held_out_or_fitted_share(mentioned_hypothesis).value
+    reasons = failed_gates[:1]
     if mentioned_hypothesis is None or explained_share < LEAST_MENTIONED_SHARE:
-        sentence = f"{gap_sentences} No effect of the catalogue follows it."
+        reasons.append("No effect of the catalogue is near.")
     elif comparison.enlarges_error(mentioned_hypothesis):
-        sentence = f"{gap_sentences} {_larger_error_sentence(comparison, mentioned_hypothesis)}"
+        reasons.append(_larger_error_sentence(comparison, mentioned_hypothesis))
     else:
         reason = reason or comparison.objection_to_naming(mentioned_hypothesis)
         if considered_hypothesis is not None and not reason:
@@ -319,28 +305,23 @@ def unexplained_outcome(
             reason = (
                 f"its probability is {probability:.2g}: a name needs {SEARCH.name_probability:g}"
             )
-        sentence = (
-            f"{gap_sentences} {_best_hypothesis_sentence(comparison, mentioned_hypothesis, reason)}"
-        )
+        nearest = effects_text(named_effects(comparison.problem, mentioned_hypothesis))
+        reasons.append(f"The nearest in the catalogue is {nearest}.")
+        if reason:
+            reasons.append(not_named_sentence(reason))
         judged_hypothesis = mentioned_hypothesis
         resembles = names_without_free_shape(mentioned_hypothesis.candidate.identifiers)
     return _outcome(
         comparison,
         VerdictKind.UNEXPLAINED,
-        sentence,
+        comparison.gap_sentence(),
         noise_verdict.probability,
         judged_hypothesis=judged_hypothesis,
         members=[],
         resembles=resembles,
         gates=noise_verdict.gates,
+        reasons=" ".join(reasons),
     )
-
-
-def _gap_text(noise_verdict: Verdict) -> str:
-    """Return the sentence that there is a gap, with the reason of the first failed test."""
-    reasons = [gate.reason for gate in noise_verdict.gates if gate.has_failed]
-    first_reason = reasons[0] if reasons else ""
-    return f"There is a gap that no effect of the catalogue fits. {first_reason}".strip()
 
 
 def _hypothesis_explaining_most(comparison: Comparison[HypothesisT]) -> HypothesisT | None:
@@ -353,16 +334,6 @@ def _hypothesis_explaining_most(comparison: Comparison[HypothesisT]) -> Hypothes
         key=lambda hypothesis: comparison.held_out_or_fitted_share(hypothesis).value,
         default=None,
     )
-
-
-def _best_hypothesis_sentence(
-    comparison: Comparison[HypothesisT], hypothesis: HypothesisT, reason: str
-) -> str:
-    """Return the sentence on the best hypothesis, and the reason why it is not named, if any."""
-    effects = effects_text(named_effects(comparison.problem, hypothesis))
-    share_clause = comparison.closed_share_clause(hypothesis)
-    sentence = f"The best hypothesis is {effects}: {share_clause}."
-    return f"{sentence} {not_named_sentence(reason)}" if reason else sentence
 
 
 def not_named_sentence(reason: str) -> str:
@@ -402,6 +373,7 @@ def _outcome(
     family: str = "",
     gates: tuple[Gate, ...] = (),
     resembles: tuple[str, ...] = (),
+    reasons: str = "",
 ) -> VerdictOutcome:
     """Return a verdict that lists all hypotheses, its members first, then the most probable ones.
 
@@ -413,7 +385,7 @@ def _outcome(
         The hypothesis that the verdict is about; None for the model without effect.
     members : sequence of HypothesisT
         The hypotheses that are listed first, in their order.
-    effects, group, family, gates, resembles
+    effects, group, family, gates, resembles, reasons
         Further attributes of the `Verdict`.
     """
     search = comparison.search
@@ -446,5 +418,6 @@ def _outcome(
         family=family,
         gates=gates,
         resembles=resembles,
+        reasons=reasons,
     )
     return outcome_with_hypotheses(verdict, search, fit, weighted_hypotheses)

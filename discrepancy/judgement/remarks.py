@@ -1,7 +1,6 @@
 """Sentences added to a verdict: when there is a gap, and which effects were not compared."""
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import replace
 from math import floor, log10
 
 from discrepancy.catalogue.entry import Effect, Setting
@@ -74,13 +73,13 @@ def _gap_window_text(window: GapWindow) -> str:
     return f"in {window.trial!r} {window_text(window)}, {size} times the noise"
 
 
-def sentence_with_times(verdict: Verdict, windows: Sequence[GapWindow]) -> str:
-    """Return the sentence of a verdict, with the times of its gap or effects if informative."""
+def verdict_with_times(verdict: Verdict, windows: Sequence[GapWindow]) -> Verdict:
+    """Return a verdict with the times of its gap or effects among its reasons, if informative."""
     times_sentence = active_windows_sentence(verdict.effects)
     is_informative = has_gap_beginning_inside(windows) or verdict.kind is VerdictKind.UNEXPLAINED
     if not times_sentence and verdict.kind not in KINDS_WITHOUT_GAP and is_informative:
         times_sentence = gap_times_sentence(windows)
-    return f"{verdict.sentence} {times_sentence}".strip()
+    return verdict.with_reasons(times_sentence)
 
 
 def has_gap_beginning_inside(windows: Sequence[GapWindow]) -> bool:
@@ -141,7 +140,7 @@ def verdict_with_untested_effects(
         return verdict
     it_or_they = "it" if len(names) == 1 else "they"
     sentence = f"Not excluded, because {it_or_they} cannot be tested here: {listing(names)}."
-    return replace(verdict, sentence=f"{verdict.sentence} {sentence}")
+    return verdict.with_reasons(sentence)
 
 
 def look_alike_remark(verdict: Verdict, compared: Iterable[Effect]) -> str | None:

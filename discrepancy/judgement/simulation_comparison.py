@@ -70,10 +70,6 @@ class SimulationComparison(Comparison[CandidateFit]):
         """All hypotheses, the most probable first."""
         return sorted(self.search.compared_fits().values(), key=lambda fit: -self.search.score(fit))
 
-    def gap_sentence(self) -> str:
-        """Return an empty sentence: simulations do not show what the gap is."""
-        return ""
-
     @cached_property
     def _noise_scales(self) -> dict[str, float]:
         """The factor on the noise deviation of residual sets, by channel.

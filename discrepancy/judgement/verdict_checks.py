@@ -17,7 +17,7 @@ from discrepancy.verdict import UnfittedRecord, Verdict, VerdictKind
 from reporting.words import listing
 
 from .closed_share import NOMINAL_UNIT, closed_share_text, rms_by_channel
-from .hypotheses import VerdictOutcome, effects_text
+from .hypotheses import UNEXPLAINED_GAP, VerdictOutcome, effects_text
 from .proof import errors_of_fit
 from .remarks import KINDS_WITHOUT_GAP
 
@@ -28,6 +28,11 @@ VETO_PREDICTIVE_DEVIATIONS = 3.0
 channel must also exceed to be far off, since the uncertainty of the fit is not a gap."""
 MOST_MENTIONED = 3
 """Largest number of records (one channel in one trial each) that a sentence mentions."""
+MISSING_IN_HELD_OUT = (
+    "The model explains the trials that were fitted, but not those held out: something is missing "
+    "that the fitted trials do not show."
+)
+"""The conclusion if only held-out trials show a gap."""
 WHITE_SECOND_DIFFERENCES = 6.0
 """Variance of the second differences of white noise over its own: 1 + 4 + 1 by their weights."""
 
@@ -59,25 +64,28 @@ def check_against_trials(outcome: VerdictOutcome) -> VerdictOutcome:
         errors = errors_of_fit(search, fit)
         if errors.has_grown:
             channels = search.problem.campaign.channels
-            sentence = _larger_error_sentence(verdict, closed_share_text(channels, errors))
-            return VerdictOutcome(_verdict_without_name(verdict, sentence), search, no_effect)
+            reason = _larger_error_sentence(verdict, closed_share_text(channels, errors))
+            verdict = _verdict_without_name(verdict, UNEXPLAINED_GAP, reason)
+            return VerdictOutcome(verdict, search, no_effect)
     # check 3: held-out trials
     residuals_without_effect = search.residuals(no_effect)
     far_records = (
         far_held_out_records(residuals_without_effect) if verdict.kind in KINDS_WITHOUT_GAP else []
     )
     if far_records:
-        sentence = _held_out_gap_sentence(residuals_without_effect, far_records)
-        return VerdictOutcome(_verdict_without_name(verdict, sentence), search, no_effect)
+        reason = _held_out_gap_sentence(residuals_without_effect, far_records)
+        verdict = _verdict_without_name(verdict, MISSING_IN_HELD_OUT, reason)
+        return VerdictOutcome(verdict, search, no_effect)
     return outcome
 
 
-def _verdict_without_name(verdict: Verdict, sentence: str) -> Verdict:
-    """Return the verdict of an unexplained gap instead of the given one, with a new sentence."""
+def _verdict_without_name(verdict: Verdict, sentence: str, reasons: str) -> Verdict:
+    """Return the verdict of an unexplained gap instead of the given one, with new sentences."""
     return replace(
         verdict,
         kind=VerdictKind.UNEXPLAINED,
         sentence=sentence,
+        reasons=reasons,
         effects=(),
         group=(),
         family="",
@@ -95,8 +103,8 @@ def _larger_error_sentence(verdict: Verdict, clause: str) -> str:
     """
     effects = effects_text(verdict.effects) or "the best hypothesis"
     return (
-        "There is a gap without a name. The most probable explanation in the catalogue is "
-        f"{effects}, but {clause}: no effect is named, and there is nothing to apply."
+        f"The most probable explanation in the catalogue is {effects}, but {clause}: no effect is "
+        "named, and there is nothing to apply."
     )
 
 
@@ -162,11 +170,7 @@ def _held_out_gap_sentence(residuals: ResidualSet, far_records: Sequence[FarReco
     unmentioned_count = len(far_records) - MOST_MENTIONED
     if unmentioned_count > 0:
         parts.append(f"{unmentioned_count} more records")
-    return (
-        "The model explains the trials that were fitted, but not those held out: it misses "
-        f"{listing(parts)}. Something is missing that the fitted trials do not show: fit trials "
-        "like these, too."
-    )
+    return f"It misses {listing(parts)}. Fit trials like these, too."
 
 
 def _value_with_unit(residuals: ResidualSet, channel: str, value: float) -> str:
@@ -226,7 +230,10 @@ def _unfitted_verdict(verdict: Verdict, unfitted: Sequence[UnfittedRecord]) -> V
         parts.append(f"{unmentioned_count} more records")
     sentence = (
         f"The model does not fit: its residuals of {listing(parts)} are larger than the variation "
-        "of the readings about their mean. That is no evidence of a missing force. Check how the "
-        "trials begin, inputs, signs and units, and try a shorter record."
+        "of the readings about their mean."
     )
-    return replace(_verdict_without_name(verdict, sentence), unfitted=tuple(unfitted))
+    reasons = (
+        "That is no evidence of a missing force. Check how the trials begin, inputs, signs and "
+        "units, and try a shorter record."
+    )
+    return replace(_verdict_without_name(verdict, sentence, reasons), unfitted=tuple(unfitted))

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from math import ceil
 from pathlib import Path
 
 import numpy as np
@@ -18,9 +17,9 @@ from discrepancy.document import Origin
 from discrepancy.files.verdict import PrimitiveInterval
 from discrepancy.judgement.separability import CONFUSION_DISTANCE, DETECTION_DISTANCE, Separability
 from discrepancy.location.residuals import ResidualSet
-from discrepancy.missing_force.port_force import MissingForce
 from discrepancy.proof_record import Scores
 from discrepancy.report import residual_figures
+from discrepancy.report.force_figure import missing_force_figure
 from discrepancy.report.load_and_time_figures import load_figure, time_line_figure
 from discrepancy.report.motion_figures import (
     backbone_figure,
@@ -32,11 +31,7 @@ from discrepancy.report.text import (
     WORDS,
     added_label,
 )
-from discrepancy.report.verdict_sentences import (
-    force_sentence,
-    port_motion_units,
-    proof_scores,
-)
+from discrepancy.report.verdict_sentences import force_sentence, proof_scores
 from discrepancy.self_calibration import SelfCalibration
 from discrepancy.workflow import Investigation
 from fe.wing.design import WingDesign
@@ -166,133 +161,6 @@ def confusion_figure(self_calibration: SelfCalibration) -> Figure:
     return figure
 
 
-MOST_DOTS = 3000
-"""Most dots of a panel; longer records are thinned evenly."""
-MOST_FORCE_SAMPLES = 400
-"""Most samples of the force in a panel over time, centred on its largest value."""
-
-
-def missing_force_figure(missing: MissingForce) -> Figure:
-    """Draw a missing force over displacement, over speed and over time.
-
-    If the force follows another variable, such as an input, it is drawn over that variable instead
-    of speed. If a law was fitted, a second row of panels shows the force that remains with it.
-    """
-    row_titles = {"force": "missing force"}
-    if missing.law:
-        row_titles["left"] = "remaining force"
-    name_of_force, displacement_unit, speed_unit = port_motion_units(missing.at_port)
-    if displacement_unit:
-        motions = {
-            "position": f"displacement, {displacement_unit}",
-            "speed": f"speed, {speed_unit}",
-        }
-    else:
-        motions = {"position": "integral of the state", "speed": f"state, {speed_unit}"}
-    followed = missing.at_port.ordered_by[:1]
-    if followed and any(followed[0] in course.variables for course in missing.courses):
-        del motions["speed"]
-        motions[followed[0]] = followed[0].removeprefix("the ")
-    sample_count = sum(len(course.time) for course in missing.courses)
-    drawn_samples = slice(None, None, ceil(sample_count / MOST_DOTS))
-    figure, rows = residual_figures.new_panels(
-        len(row_titles), 3, 1.6 * len(row_titles) + 0.5, sharey=True
-    )
-    letters = iter("abcdef")
-    for row, (series, title) in zip(rows, row_titles.items(), strict=True):
-        law = "law" if missing.law and series == "force" else ""
-        for axes, (motion, label) in zip(row[:2], motions.items(), strict=True):
-            _draw_over_motion(axes, missing, motion, series, law, drawn_samples)
-            axes.set_xlabel(label)
-        _draw_over_time(row[2], missing, series, has_law=bool(law))
-        row[0].set_ylabel(f"{name_of_force}, {missing.at_port.unit}")
-        for axes in row:
-            axes.axhline(0.0, color=style.REFERENCE, lw=0.6, zorder=0)
-            axes.locator_params(axis="x", nbins=4)  # the integral of a state may have six digits
-            axes.tick_params(labelleft=True)
-            style.panel_label(axes, next(letters), title)
-    handles, labels = rows[0][0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside upper right", ncols=2, markerscale=3.0)
-    return figure
-
-
-def _draw_over_time(axes: Axes, missing: MissingForce, series: str, *, has_law: bool) -> None:
-    """Draw a force over time around its largest value, in the trial in which that occurs.
-
-    Parameters
-    ----------
-    series : str
-        "force", or "left" for the force that remains with its law.
-    has_law : bool
-        True to draw the law as well.
-    """
-    strongest = max(missing.courses, key=lambda course: float(np.max(np.abs(course.force))))
-    # the samples around the largest force, within the record
-    first = int(np.argmax(np.abs(strongest.force))) - MOST_FORCE_SAMPLES // 2
-    first = max(min(first, len(strongest.time) - MOST_FORCE_SAMPLES), 0)
-    drawn = slice(first, first + MOST_FORCE_SAMPLES)
-    time = strongest.time[drawn]
-    values = getattr(strongest, series)[drawn]
-    two_deviations = 2.0 * strongest.deviation[drawn]
-    style.band(axes, time, values - two_deviations, values + two_deviations, style.OBSERVED)
-    axes.plot(time, values, color=style.OBSERVED, lw=0.9)
-    if has_law and strongest.law is not None:
-        axes.plot(time, strongest.law[drawn], "--", color=style.PREDICTION, lw=0.9)
-    axes.set_xlabel(f"time in {strongest.trial}, s")
-
-
-def _draw_over_motion(
-    axes: Axes, missing: MissingForce, motion: str, series: str, law: str, samples: slice
-) -> None:
-    """Draw a force over a motion of its port, with its law if there is one.
-
-    Parameters
-    ----------
-    axes : Axes
-        The axes to draw on.
-    missing : MissingForce
-        The missing force.
-    motion, series, law : str
-        Names of the arrays of a trial: of the motion or of another variable, of the force, and of
-        the force by its law (empty if there is no law).
-    samples : slice
-        Samples that are drawn.
-    """
-    is_variable = any(motion in course.variables for course in missing.courses)
-    courses = [
-        course for course in missing.courses if not is_variable or motion in course.variables
-    ]
-
-    def joined(name: str) -> FloatArray:
-        """Return an array of the trials that have it, joined in their order."""
-        arrays = [course.variables.get(name, getattr(course, name, None)) for course in courses]
-        return np.concatenate([array[samples] for array in arrays if array is not None])
-
-    positions = joined(motion)
-    values = joined(series)
-    deviation = joined("deviation")
-    axes.vlines(
-        positions,
-        values - deviation,
-        values + deviation,
-        color=style.OBSERVED,
-        lw=0.4,
-        alpha=style.BAND_OPACITY,
-    )
-    label = "seen, ± 1 deviation"
-    axes.plot(positions, values, ".", color=style.OBSERVED, ms=2.6, alpha=0.6, label=label)
-    if law:
-        axes.plot(
-            positions,
-            joined(law),
-            ".",
-            color=style.PREDICTION,
-            ms=1.2,
-            alpha=0.7,
-            label=missing.law,
-        )
-
-
 Pack = Callable[[Path, Path], str]
 """Function that packs an FMU: from `patch.json` and the FMU's path to a sentence about it."""
 
@@ -366,7 +234,9 @@ def report_figures(content: ReportInput) -> dict[str, ReportFigure]:
     missing = investigation.missing
     if missing is not None:
         sentence = force_sentence(missing.at_port)
-        _add_figure(figures, "missing_force", missing_force_figure(missing), sentence=sentence)
+        law = "The law is the orange line. " if missing.law else ""
+        drawing = missing_force_figure(missing)
+        _add_figure(figures, "missing_force", drawing, sentence=sentence, law=law)
     if investigation.before is not None:
         _add_residual_figures(figures, content, investigation.before)
     if investigation.proof is not None:

@@ -4,67 +4,51 @@ from collections.abc import Mapping
 from math import isfinite
 
 from discrepancy.catalogue.entry import Effect
-from discrepancy.judgement.closed_share import percent_with_interval
-from discrepancy.judgement.curve_words import curve_in_words, curve_of, followed_variable
-from discrepancy.judgement.hypotheses import effects_text, named_effects, probability_text
-from discrepancy.judgement.remarks import KINDS_WITHOUT_GAP, gap_times_sentence
+from discrepancy.judgement.closed_share import (
+    channels_by_error,
+    error_change_text,
+    percent_with_interval,
+)
+from discrepancy.judgement.curve_words import curve_of
+from discrepancy.judgement.hypotheses import is_gain_error, named_effects
+from discrepancy.judgement.remarks import (
+    KINDS_OF_NOISE_ALONE,
+    KINDS_WITH_NAME,
+    KINDS_WITHOUT_GAP,
+    gap_times_sentence,
+)
 from discrepancy.location.locate import Location
 from discrepancy.report import tables, verdict_tables
 from discrepancy.report.decidability_text import group_lines
 from discrepancy.report.figures import ReportInput
+from discrepancy.report.levels import levels_table
 from discrepancy.report.sensor_table import sensor_table
 from discrepancy.report.sizes import size_sentence
 from discrepancy.report.text import (
     NAMING,
     WORDS,
     added_label,
-    estimate_text,
     formula,
-    number,
-    parameter_text,
-    unit_text,
 )
 from discrepancy.report.verdict_sentences import (
-    ROLE_OF_PROBABILITY,
     error_sentence,
-    group_members,
-    headline,
+    left_sentence,
     noise_levels,
     parameters_sentence,
     proof_scores,
     remainders_sentence,
-    tested_trials,
 )
-from discrepancy.verdict import Gate, NamedEffect, ParameterEstimate, Verdict, VerdictKind
+from discrepancy.verdict import NamedEffect, Verdict, VerdictKind
 from discrepancy.workflow import Investigation
 from reporting.pages.page import Block, Fold, Highlights, Notice, Page, PageFigure, Section
-from reporting.words import capital, counted, listing, with_short_hashes
+from reporting.words import capital, counted, with_short_hashes
 
-LONGEST_CARD = 60
-"""Most characters of a card of the page; the sentence below it has all names."""
+LOOKS = ("history", "load", "backbone", "spectrum")
+"""Figures of readings and residuals; the first one opens the page if no force is missing."""
 LEAST_SHOWN_SHARE = 0.05
 """Share of the residuals below which a disagreement is left to the file."""
 MOST_SHOWN_DISAGREEMENTS = 8
 """Most disagreements of model and data that the page lists."""
-
-OPENING = {
-    VerdictKind.NOTHING_MISSING: "is missing",
-    VerdictKind.NAMED: "is missing",
-    VerdictKind.NAMED_IN_PART: "is missing; the remainder is larger than noise",
-    VerdictKind.FAMILY: "is missing",
-    VerdictKind.GROUP: "is missing: these data cannot tell which",
-    VerdictKind.UNEXPLAINED: "fits what is missing",
-    VerdictKind.DATA_ERROR: "are at fault",
-    VerdictKind.BELOW_LIMIT: "is missing",
-}
-"""What the first card of the page says of its text."""
-
-TEXT_WITHOUT_EFFECT = {
-    VerdictKind.NOTHING_MISSING: "nothing",
-    VerdictKind.DATA_ERROR: "the data",
-    VerdictKind.BELOW_LIMIT: "nothing that could be detected",
-}
-"""The text of the first card for verdicts that name no effect."""
 
 
 def verdict_page(content: ReportInput, figures: Mapping[str, PageFigure]) -> Page:
@@ -80,9 +64,10 @@ def verdict_page(content: ReportInput, figures: Mapping[str, PageFigure]) -> Pag
     origin = content.origin
     investigation = content.investigation
     verdict = investigation.verdict
+    picture = next((name for name in ("missing_force", *LOOKS) if name in figures), "")
     sections = []
     if verdict.kind is not VerdictKind.DATA_ERROR:  # faulty data are not fitted
-        looks = [figures.get(name) for name in ("history", "backbone", "spectrum", "load")]
+        looks = [figures.get(name) for name in LOOKS if name != picture]
         sections = [
             _next_experiment_section(verdict),
             _location_section(investigation, figures),
@@ -94,10 +79,9 @@ def verdict_page(content: ReportInput, figures: Mapping[str, PageFigure]) -> Pag
     provenance = Fold("Campaign, model, command and versions", [tables.origin_table(origin)])
     return Page(
         origin.campaign,
-        f"What the model “{origin.model}” lacks compared with these data: located, named, added, "
-        "proved",
-        sentence=verdict_card(verdict),
-        picture=figures.get("missing_force"),
+        f"What the model “{origin.model}” lacks",
+        sentence=f"{verdict.sentence} {sizes_sentence(content)}".rstrip(),
+        picture=figures.get(picture),
         outcome=_outcome(content),
         sections=[
             Section("Effects", [verdict_tables.effects_table(content)]),
@@ -114,146 +98,93 @@ def verdict_page(content: ReportInput, figures: Mapping[str, PageFigure]) -> Pag
 
 
 def _outcome(content: ReportInput) -> list[Block]:
-    """Return the blocks of the outcome: the verdict in numbers and, folded below, in sentences."""
+    """Return the blocks of the outcome: errors, the four questions, what is left, and why."""
     investigation = content.investigation
     verdict = investigation.verdict
     catalogue: dict[str, Effect] = {}
     if investigation.search is not None:
         catalogue = {effect.identifier: effect for effect in investigation.search.effects}
-    sentences: list[Block] = [
-        Notice(headline(verdict)),
-        f"{sizes_sentence(content)} {error_sentence(investigation)}",
-        _meaning(verdict),
-        remainders_sentence(verdict),
-    ]
-    if verdict.kind is VerdictKind.UNEXPLAINED and verdict.resembles:
-        names = [catalogue[name].name if name in catalogue else name for name in verdict.resembles]
-        sentences.append(
-            f"The nearest in the catalogue is {listing(names)}; this is a resemblance and not a "
-            "name."
-        )
+    explanations: list[Block] = [_meaning(verdict)]
+    errors = _errors_before_and_after(investigation)
     effects: dict[str, NamedEffect] = {}
     for effect in verdict.effects:
         effects.setdefault(effect.identifier, effect)
     for effect in effects.values():
         if effect.identifier in catalogue:
-            sentences.append(_effect_paragraph(effect, catalogue[effect.identifier]))
-    return [Highlights(_highlights(investigation)), Fold("How this was concluded", sentences)]
+            explanations.append(_effect_paragraph(effect, catalogue[effect.identifier]))
+    # an error of the model may hide in what a fit without an effect moves
+    hidden = verdict.reasons if verdict.kind in KINDS_WITHOUT_GAP else ""
+    return [
+        Notice(hidden),
+        Highlights(errors),
+        "" if errors else error_sentence(investigation),
+        levels_table(investigation),
+        left_over_sentence(verdict),
+        "" if verdict.kind in KINDS_WITHOUT_GAP else verdict.reasons,
+        _next_test_sentence(verdict),
+        Fold("What this verdict means", explanations),
+    ]
 
 
-def verdict_card(verdict: Verdict) -> str:
-    """Return the verdict in one line: what is missing, where, how large, and how sure that is.
-
-    The size is the missing force at its port or, if there is no such force, the first parameter of
-    a named effect with its 90 % interval. If no effect is named, the card says what the force
-    depends on. If nothing is missing, it mentions the parameter, gain or zero that the fit moves
-    farthest.
-    """
-    clauses = [f"{capital(missing_effects_text(verdict))} {OPENING[verdict.kind]}"]
-    moved_unknowns = (*verdict.moved, *verdict.moved_within_prior)
-    if verdict.kind in KINDS_WITHOUT_GAP and moved_unknowns:
-        farthest = moved_unknowns[0]
-        clauses.append(
-            f"but with {farthest.name} moved by {abs(farthest.deviations):.1f} stated deviations, "
-            "where an error of the model may hide"
-        )
-    curve = curve_of(verdict.effects)
-    if curve is not None:
-        unit = "N" if verdict.force is None else verdict.force.unit
-        clauses.append(curve_in_words(curve, unit))
-    parameters: list[ParameterEstimate] = []
-    if verdict.kind in NAMING and curve is None:
-        for effect in verdict.effects:
-            parameters += effect.parameters
-    if verdict.force is not None:
-        force = verdict.force
-        clauses.append(f"{number(force.rms)} {force.unit} (rms) at {force.port}")
-        if verdict.kind is VerdictKind.UNEXPLAINED:
-            clauses.append(force.dependence)
-    elif parameters:
-        value, interval = estimate_text(parameters[0])
-        size = f"{parameter_text(parameters[0])} {value} {unit_text(parameters[0].unit)}".rstrip()
-        clauses.append(f"{size} ({interval})")
-    if isfinite(verdict.probability) and verdict.kind is not VerdictKind.UNEXPLAINED:
-        role = "probability"
-        if verdict.kind is VerdictKind.BELOW_LIMIT:
-            role = ROLE_OF_PROBABILITY[verdict.kind]
-        clauses.append(f"{role} {probability_text(verdict.probability)}")
-    return f"{'; '.join(clauses)}."
-
-
-def _highlights(investigation: Investigation) -> list[tuple[str, str]]:
-    """Return the values that support the card of the page, each with its meaning."""
-    verdict = investigation.verdict
+def _errors_before_and_after(investigation: Investigation) -> list[tuple[str, str]]:
+    """Return the errors of the model before and after what was added, each with its meaning."""
     proof = investigation.proof
-    force = verdict.force
+    if proof is None or proof.closed is None:
+        return []  # the trials do not test what was added
+    before, after, role = proof_scores(proof)
     values = []
-    if proof is not None and proof.closed is not None:
-        taken_or_added = "taken away" if proof.closed.value >= 0.0 else "added"
-        is_named = verdict.kind in (*NAMING, VerdictKind.FAMILY)
-        reservation = "" if is_named else ", which is not named"
-        meaning = (
-            f"of the mean square error in {proof.closed.trials} trials is {taken_or_added} by "
-            f"{added_label(investigation)}{reservation}"
-        )
-        values.append((percent_with_interval(proof.closed), meaning))
-    if force is not None and force.ordered_by and not tested_trials(force):
-        meaning = f"what the force follows, with {force.followed_percent} % of its variance"
-        values.append((listing(force.ordered_by), meaning))
-    if proof is not None and force is None:
-        before, _, trials = proof_scores(proof)
-        if isfinite(before.chi_square_per_sample):
-            meaning = f"times the noise, rms on {trials} trials, before and after"
-            values.append((" → ".join(noise_levels(proof)), meaning))
-    gates = deciding_gates(verdict)
-    if gates and proof is None and force is None:
-        gate = gates[0]
-        meaning = f"p of the {gate.name}; a fit has at least {number(gate.limit)}"
-        values.append((number(gate.statistic), meaning))
+    for name in channels_by_error(investigation.campaign.channels, before.rms)[:1]:
+        error = error_change_text(investigation.campaign.channels, name, before.rms, after.rms)
+        values.append((error, f"rms error of {name} in {role} trials, before and after"))
+    if isfinite(before.chi_square_per_sample):
+        meaning = f"times the noise: rms error in {role} trials, before and after"
+        values.append((" → ".join(noise_levels(proof)), meaning))
+    explained = "taken away" if proof.closed.value >= 0.0 else "added"
+    meaning = f"of the mean square error in {role} trials is {explained}"
+    if investigation.verdict.kind not in KINDS_WITH_NAME:
+        meaning += f" by {added_label(investigation)}, which is not named"
+    values.append((percent_with_interval(proof.closed), meaning))
     return values
 
 
-def missing_effects_text(verdict: Verdict) -> str:
-    """Return a few words on what the model lacks, for a card at the top of the page."""
-    members = group_members(verdict)
-    if members:
-        names = listing(members, "or")
-        return names if len(names) <= LONGEST_CARD else f"one of {len(members)} hypotheses"
-    if verdict.kind in TEXT_WITHOUT_EFFECT:
-        return TEXT_WITHOUT_EFFECT[verdict.kind]
-    curve = curve_of(verdict.effects)
-    if curve is not None:
-        return f"a force that follows the {followed_variable(curve)}"
-    phrases = []
-    if verdict.kind in NAMING:
-        # an effect whose shape was freed is named by its family
-        effects = [effect for effect in verdict.effects if not (effect.shape and verdict.family)]
-        phrases.append(effects_text(effects))
-    if verdict.family:
-        phrases.append(f"an effect of the family {verdict.family}")
-    return listing(filter(None, phrases)) or "no name"
+def left_over_sentence(verdict: Verdict) -> str:
+    """Return what the effects of a verdict leave: of the force, or of the readings.
+
+    It is empty if they leave only noise.
+    """
+    if verdict.kind in KINDS_OF_NOISE_ALONE:
+        return ""
+    return left_sentence(verdict.force) or remainders_sentence(verdict)
+
+
+def _next_test_sentence(verdict: Verdict) -> str:
+    """Return the sentence on the test that would decide most; empty without any."""
+    if not verdict.next_experiments:
+        return ""
+    return f"Measure next: {verdict.next_experiments[0].description}"
 
 
 def sizes_sentence(content: ReportInput) -> str:
-    """Return the sentence on the sizes of the named effects, in SI units or by their parameters."""
+    """Return the sentence on the sizes of named effects, in SI units or by their parameters.
+
+    It is empty without a name, as the sizes of a group are in its table.
+    """
     investigation = content.investigation
-    if content.intervals and investigation.problem is not None and investigation.fit is not None:
+    has_name = investigation.verdict.kind in KINDS_WITH_NAME
+    if (
+        has_name
+        and content.intervals
+        and investigation.problem is not None
+        and investigation.fit is not None
+    ):
         effects = named_effects(investigation.problem, investigation.fit)
         sentence = size_sentence(investigation, effects, content.intervals)
         if sentence:
             return sentence
     verdict = investigation.verdict
-    return parameters_sentence(verdict.effects if verdict.kind in NAMING else ())
-
-
-def deciding_gates(verdict: Verdict) -> list[Gate]:
-    """Return the gates that compared a p-value; those that did not pass come first."""
-    compared = [
-        gate
-        for gate in verdict.gates
-        if isfinite(gate.statistic) and gate.name not in ("shape", "held-out trials")
-    ]
-    return sorted(compared, key=lambda gate: not gate.has_failed)
+    if verdict.kind not in NAMING or curve_of(verdict.effects) is not None:
+        return ""  # the sentence of the verdict describes a curve, and has the gain of a sensor
+    return parameters_sentence(effect for effect in verdict.effects if not is_gain_error(effect))
 
 
 def _meaning(verdict: Verdict) -> str:
@@ -283,9 +214,9 @@ def _next_experiment_section(verdict: Verdict) -> Section:
     return Section(
         "Next experiment",
         [
-            "What would decide most between the hypotheses that are still open, for its cost. "
-            "Information is the mutual information of hypothesis and data, by simulation; ln 2 = "
-            "0.69 nat decides between two equals.",
+            "What would decide most between the explanations that are still open, for its cost. "
+            "Information is the mutual information of explanation and data, by simulation: 1 bit "
+            "decides between two that are equally probable.",
             gap_times_sentence(verdict.windows),
             verdict_tables.next_experiments_table(verdict),
         ],

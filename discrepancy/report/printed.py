@@ -7,25 +7,27 @@ from math import isfinite
 from discrepancy.campaign.records import Campaign
 from discrepancy.catalogue.entry import Effect
 from discrepancy.checks.fault import DataFault
-from discrepancy.judgement.hypotheses import probability_text
-from discrepancy.judgement.remarks import gap_times_sentence
+from discrepancy.judgement.curve_words import curve_of
+from discrepancy.judgement.hypotheses import is_gain_error
+from discrepancy.judgement.moved_unknowns import MOVED_DEVIATIONS
+from discrepancy.judgement.remarks import (
+    KINDS_WITH_NAME,
+    KINDS_WITHOUT_GAP,
+    gap_times_sentence,
+    has_gap_beginning_inside,
+)
 from discrepancy.judgement.separability import Separability
 from discrepancy.report import tables, verdict_tables
 from discrepancy.report.decidability_text import campaign_needs, confused_effects, group_lines
 from discrepancy.report.figures import ReportInput
-from discrepancy.report.page import remarks_beside_faults, sizes_sentence
+from discrepancy.report.levels import levels_table
+from discrepancy.report.page import left_over_sentence, remarks_beside_faults, sizes_sentence
 from discrepancy.report.sensor_table import printed_sensor_table
-from discrepancy.report.text import number
-from discrepancy.report.verdict_sentences import (
-    error_sentence,
-    force_sentence,
-    headline,
-    proof_scores,
-    remainders_sentence,
-)
+from discrepancy.report.verdict_sentences import error_sentence
+from discrepancy.report.verdict_tables import bits
 from discrepancy.self_calibration import SelfCalibration
 from discrepancy.system.interface import Model
-from discrepancy.verdict import Verdict, VerdictKind
+from discrepancy.verdict import Verdict
 from discrepancy.workflow import Investigation
 from reporting.pages.table import Table
 from reporting.words import counted, listing
@@ -44,12 +46,21 @@ def verdict_lines(content: ReportInput) -> Iterator[str | Table]:
     """
     investigation = content.investigation
     verdict = investigation.verdict
-    yield from _sentences_on_gap(content)
-    yield verdict_tables.printed_effects_table(verdict)
-    yield printed_sensor_table(verdict.sensors, investigation.campaign.channels)
-    yield from filter(None, _sentences_on_proof(investigation))
-    for experiment in verdict.next_experiments[:MOST_PRINTED_EXPERIMENTS]:
-        yield f"Next: {experiment.description} ({experiment.information:.2f} nat)"
+    yield f"{verdict.sentence} {sizes_sentence(content)}".rstrip()
+    yield levels_table(investigation)
+    yield from filter(None, _sentences_on_errors(investigation))
+    for number, experiment in enumerate(verdict.next_experiments[:MOST_PRINTED_EXPERIMENTS], 1):
+        test = experiment.description.rstrip(".")
+        yield f"Measure next, {number}: {test} ({bits(experiment):.2f} bit)"
+    if verdict.reasons:
+        yield verdict.reasons
+    if not _tells_all_sizes(verdict):
+        yield verdict_tables.printed_effects_table(verdict)
+    if verdict.kind in (*KINDS_WITH_NAME, *KINDS_WITHOUT_GAP):
+        sensors = verdict.sensors
+        if verdict.kind in KINDS_WITH_NAME:
+            sensors = tuple(item for item in sensors if abs(item.deviations) > MOVED_DEVIATIONS)
+        yield printed_sensor_table(sensors, investigation.campaign.channels)
     for fault in investigation.faults:
         yield f"Data: {fault.sentence}"
     for remark in remarks_beside_faults(investigation):
@@ -58,58 +69,25 @@ def verdict_lines(content: ReportInput) -> Iterator[str | Table]:
         yield _self_calibration_sentence(content.self_calibration)
 
 
-def _sentences_on_gap(content: ReportInput) -> Iterator[str]:
-    """Yield the sentences on what is missing, when it acts, and how probable it is."""
-    verdict = content.investigation.verdict
-    times = gap_times_sentence(verdict.windows)
-    sentences = [
-        headline(verdict),
-        sizes_sentence(content) if content.intervals else "",
-        "" if verdict.force is None else force_sentence(verdict.force),
-        remainders_sentence(verdict),
-        "" if times in verdict.sentence else times,
-        _probability_sentence(verdict),
-    ]
-    yield from filter(None, sentences)
-
-
-def _probability_sentence(verdict: Verdict) -> str:
-    """Return the probability of a verdict and its Bayes factor; empty if it has none."""
-    if not isfinite(verdict.probability) or verdict.kind is VerdictKind.UNEXPLAINED:
-        return ""
-    subject = "Probability"
-    if verdict.kind is VerdictKind.BELOW_LIMIT:
-        subject = "Probability that nothing is missing"
-    sentence = f"{subject} {probability_text(verdict.probability)}"
-    if verdict.kind is not VerdictKind.NOTHING_MISSING:
-        sentence += f", ln Bayes factor against nothing missing {verdict.log_bayes_factor:.1f}"
-    return f"{sentence}."
-
-
-def _sentences_on_proof(investigation: Investigation) -> Iterator[str]:
-    """Yield the sentences on the proof: the comparison of residuals without and with the effects.
-
-    The first sentence states the fraction of the model's error that the effects explain. The second
-    one states chi-square per sample without and with them, on the held-out trials if there are any,
-    else on the fitted trials. Nothing is yielded without a proof.
-    """
-    proof = investigation.proof
-    if proof is None:
-        return
-    yield error_sentence(investigation)
-    before, after, trial_role = proof_scores(proof)
-    if not isfinite(before.chi_square_per_sample):
-        # chi-square is not known without a noise record, and this sentence says so
-        yield proof.remaining
-        return
-    trial_remark = "none is held out"
-    if trial_role == "held-out":
-        trial_remark = ", ".join(trial.name for trial in investigation.campaign.held_out)
-    yield (
-        f"χ² per sample on {trial_role} trials ({trial_remark}): "
-        f"{number(before.chi_square_per_sample)} before, "
-        f"{number(after.chi_square_per_sample)} with the effect, 1 for noise alone."
+def _tells_all_sizes(verdict: Verdict) -> bool:
+    """Return whether the first sentences have all sizes: of a curve, or of the gain of a sensor."""
+    is_gain_alone = len(verdict.effects) == 1 and is_gain_error(verdict.effects[0])
+    return verdict.kind in KINDS_WITH_NAME and (
+        is_gain_alone or curve_of(verdict.effects) is not None
     )
+
+
+def _sentences_on_errors(investigation: Investigation) -> Iterator[str]:
+    """Yield the errors before and after, what is left, and when there is a gap."""
+    verdict = investigation.verdict
+    proof = investigation.proof
+    yield error_sentence(investigation)
+    if proof is not None and not isfinite(proof.fitted_before.chi_square_per_sample):
+        yield proof.remaining  # it is not known what remains without a noise record
+    yield left_over_sentence(verdict)
+    times = gap_times_sentence(verdict.windows)
+    if times not in verdict.reasons and has_gap_beginning_inside(verdict.windows):
+        yield times
 
 
 def _self_calibration_sentence(self_calibration: SelfCalibration) -> str:

@@ -10,17 +10,20 @@ from discrepancy.campaign.records import Campaign, FloatArray, Quantity
 from discrepancy.campaign.units import UNITS
 from discrepancy.catalogue.effect_in_setting import MOTION_WORDS
 from discrepancy.files.verdict import PrimitiveInterval
-from discrepancy.report.text import NAMING, unit_text
+from discrepancy.report.text import unit_text
 from discrepancy.system.interface import Model
 from discrepancy.system.response import EITHER, MOVES, TURNS
-from discrepancy.verdict import NamedEffect, VerdictKind
+from discrepancy.verdict import NamedEffect
 from discrepancy.workflow import Investigation
 from fe.runtime.patch import (
     CHANNEL_UNIT,
     InterfaceCompliance,
     ModelPatch,
     PlaceMass,
+    PowerDamping,
+    PowerStiffness,
     Primitive,
+    SensorLag,
     SupportCompliance,
     TableDamping,
     TableStiffness,
@@ -69,6 +72,9 @@ def si_sizes(
             continue  # the page has its points
         if not unit or size.parameter in BESIDE or size.value == 0.0:
             continue
+        verb = _verb(size, primitive)
+        if verb and size.value < 0.0:  # the verb says the sign
+            size = replace(size, value=-size.value, low=-size.high, high=-size.low)
         half_width = 0.0
         interval = ""
         if isinstance(primitive, SupportCompliance | InterfaceCompliance):
@@ -77,7 +83,7 @@ def si_sizes(
         if isfinite(size.low) and isfinite(size.high) and size.low < size.high:
             half_width = 0.5 * (size.high - size.low)
             interval = f" ({between(size.low, size.high, half_width)})"
-        name = _size_name(size.parameter, primitive, unit)
+        name = verb or _size_name(size.parameter, primitive, unit)
         if isinstance(primitive, SupportCompliance):
             motion = _motion_text(primitive.motion)
             name = f"the support {primitive.support} {motion} against a spring of"
@@ -90,6 +96,26 @@ def si_sizes(
             place_text = _location_text(primitive, size, model, campaign)
         sizes[f"{name} {rounded(size.value, half_width)} {unit}{interval}{place_text}"] = None
     return ", ".join(sizes)
+
+
+def _verb(interval: PrimitiveInterval, primitive: Primitive) -> str:
+    """Return what a port or channel does by the sign of a number: rubs, softens, stiffens, lags.
+
+    Empty if no verb says it. Of a law that grows faster than the displacement, the force is added
+    to that of the spring.
+    """
+    if isinstance(primitive, SensorLag):
+        channel = "each channel" if primitive.channel == "*" else primitive.channel
+        return f"{channel} {'lags' if interval.value > 0.0 else 'leads'} by"
+    if interval.parameter != "coefficient":
+        return ""
+    if isinstance(primitive, PowerDamping):
+        is_dry = primitive.velocity_exponent == primitive.displacement_exponent == 0.0
+        return f"{primitive.port} rubs with" if is_dry else ""
+    if isinstance(primitive, PowerStiffness) and primitive.exponent > 1.0:
+        verb = "stiffens by" if interval.value > 0.0 else "softens by"
+        return f"{primitive.port} {verb}"
+    return ""
 
 
 def _as_spring(
@@ -128,8 +154,6 @@ def size_sentence(
     intervals : sequence of sequence of PrimitiveInterval
         Intervals of the numbers of each effect.
     """
-    is_named = investigation.verdict.kind in (*NAMING, VerdictKind.FAMILY)
-    is_only_effect = is_named and len(effects) == 1
     phrases = []
     for effect, intervals_of_effect in zip(effects, intervals, strict=True):
         sizes = si_sizes(
@@ -137,15 +161,12 @@ def size_sentence(
         )
         name = f"a law of the family {effect.family}" if effect.shape else effect.name
         if sizes:
-            phrases.append(sizes if is_only_effect else f"{name}, {sizes}")
+            phrases.append(sizes if len(effects) == 1 else f"{name}, {sizes}")
     if not phrases:
         return ""
-    begin = "In SI units"
-    if not is_named:
-        begin = "In SI units, for the most probable member, which is not named"
     has_intervals = any(" to " in phrase for phrase in phrases)
     brackets = "; 90 % intervals in brackets" if has_intervals else ""
-    return f"{begin}: {'; '.join(phrases)}{brackets}."
+    return f"Size: {'; '.join(phrases)}{brackets}."
 
 
 def _size_name(parameter: str, primitive: Primitive, unit: str) -> str:

@@ -1,16 +1,14 @@
 """Sentences on a verdict, for the report and for the summary on the terminal."""
 
-import re
 from collections.abc import Iterable
-from math import isnan
+from math import isfinite
 
 from discrepancy.judgement.closed_share import closed_share_text
-from discrepancy.judgement.hypotheses import effects_text, probability_text
+from discrepancy.judgement.hypotheses import effects_text
+from discrepancy.judgement.remarks import KINDS_WITH_NAME
 from discrepancy.proof_record import ErrorComparison, Proof, Scores
 from discrepancy.report.text import (
-    NAMING,
     estimate_text,
-    nats,
     number,
     parameter_text,
     unit_text,
@@ -18,13 +16,6 @@ from discrepancy.report.text import (
 from discrepancy.verdict import ForceAtPort, ForceLeft, NamedEffect, Verdict, VerdictKind
 from discrepancy.workflow import Investigation
 from reporting.words import counted
-
-ROLE_OF_PROBABILITY = {
-    VerdictKind.NOTHING_MISSING: "probability that nothing is missing",
-    VerdictKind.FAMILY: "probability",
-    VerdictKind.BELOW_LIMIT: "probability that nothing is missing",
-}
-"""What the probability of a verdict is the probability of; other kinds say it themselves."""
 
 MOTION_OF_FORCE_UNIT = {
     "N": ("force", "m", "m/s"),
@@ -34,25 +25,6 @@ MOTION_OF_FORCE_UNIT = {
 """What is missing at a port, and the units of its displacement and speed, by the unit of force."""
 ROUNDING_OF_MOTION = 1e-9
 """Displacement or speed over its rms below which it is a rounding error, as at a release."""
-
-
-def headline(verdict: Verdict) -> str:
-    """Return the verdict in one sentence, with its probability.
-
-    Identifiers of effects in the sentence are replaced by their names.
-    """
-    sentence = verdict.sentence.rstrip(".")
-    effects = [*verdict.effects]
-    for hypothesis in verdict.hypotheses:
-        effects += hypothesis.effects
-    for identifier, name in {effect.identifier: effect.name for effect in effects}.items():
-        # names first, because a name may contain the identifier
-        name_or_identifier = rf"{re.escape(name)}|\b{identifier}\b"
-        sentence = re.sub(name_or_identifier, name.replace("\\", r"\\"), sentence)
-    role = ROLE_OF_PROBABILITY.get(verdict.kind)
-    if isnan(verdict.probability) or "probability" in sentence or role is None:
-        return f"{sentence}."
-    return f"{sentence} ({role} {probability_text(verdict.probability)})."
 
 
 def group_members(verdict: Verdict) -> dict[str, tuple[NamedEffect, ...]]:
@@ -97,31 +69,16 @@ def port_motion_units(force: ForceAtPort) -> tuple[str, str, str]:
 
 
 def force_sentence(force: ForceAtPort) -> str:
-    """Return the sentences on a missing force: where it acts, how large it is, and its law.
-
-    The first sentence also compares the evidence for the port with that for the second best port.
-    """
+    """Return the sentence on a missing force: its size, and its largest value with the motion."""
     name, displacement_unit, speed_unit = port_motion_units(force)
-    evidence = force.evidence[force.port]
-    other_ports = {port: value for port, value in force.evidence.items() if port != force.port}
-    size = (
-        f"A {name} of {number(force.rms)} {force.unit} (rms) is missing at {force.port}, "
-        f"at most {number(abs(force.largest.force))}"
-    )
     motion = f"{_motion_text(force.largest.speed, force.speed)} {speed_unit}"
     if displacement_unit:
         displacement = _motion_text(force.largest.displacement, force.displacement)
         motion = f"{displacement} {displacement_unit} and {motion}"
-    comparison = f"evidence {nats(evidence)} nat over none"
-    if other_ports:
-        nearest = max(other_ports, key=lambda port: other_ports[port])
-        ahead = evidence - other_ports[nearest]
-        more_or_less = "more" if ahead >= 0.0 else "less"
-        comparison += f", {nats(abs(ahead))} {more_or_less} than at {nearest}"
-    # a force with a law depends on what the law says
-    dependence = "" if force.law else f"; {force.dependence}"
-    sentence = f"{size} at {motion}{dependence} ({comparison})."
-    return f"{sentence} {_sentence_on_law(force)}".rstrip()
+    return (
+        f"A {name} of {number(force.rms)} {force.unit} (rms) is missing at {force.port}, at most "
+        f"{number(abs(force.largest.force))} {force.unit} at {motion}."
+    )
 
 
 def _motion_text(value: float, rms: float) -> str:
@@ -129,16 +86,19 @@ def _motion_text(value: float, rms: float) -> str:
     return number(value if abs(value) > ROUNDING_OF_MOTION * rms else 0.0)
 
 
-def _sentence_on_law(force: ForceAtPort) -> str:
+def left_sentence(force: ForceAtPort | None) -> str:
     """Return how much of a missing force its law leaves; empty if this was not tested."""
+    if force is None:
+        return ""
     phrases = []
     for role, remainder in tested_trials(force):
         trials = counted(remainder.trials, f"{role} trial")
-        phrases.append(
-            f"{number(remainder.left)} of {number(remainder.whole)} {force.unit} (rms) are left "
-            f"in {trials}"
-        )
-    return f"Beside {force.law} {', and '.join(phrases)}." if phrases else ""
+        size = f"{number(remainder.left)} {force.unit} (rms) in {trials}"
+        if remainder.whole > 0.0:
+            share = 100.0 * remainder.left / remainder.whole
+            size = f"{size}, {share:.0f} % of the {force.noun} there"
+        phrases.append(size)
+    return f"Left beside {force.law}: {'; '.join(phrases)}." if phrases else ""
 
 
 def tested_trials(force: ForceAtPort | None) -> list[tuple[str, ForceLeft]]:
@@ -169,24 +129,27 @@ def proof_scores(proof: Proof) -> tuple[Scores, Scores, str]:
 def error_sentence(investigation: Investigation) -> str:
     """Return the sentence that says which fraction of the model's error the added effects explain.
 
-    If that fraction could not be computed, it is the sentence with the reason. It is empty if
-    nothing was added to the model.
+    It ends with the error over the noise, before and after. If the fraction could not be computed,
+    it is the sentence with the reason. It is empty if nothing was added to the model.
     """
     proof = investigation.proof
     if proof is None:
         return ""
     if proof.closed is None:
         return proof.closed_reason
-    is_named = investigation.verdict.kind in (*NAMING, VerdictKind.FAMILY)
+    kind = investigation.verdict.kind
+    subject = "It"
+    if kind not in KINDS_WITH_NAME:
+        nearest = "first" if kind is VerdictKind.GROUP else "nearest in the catalogue"
+        subject = f"The {nearest}, which is not named,"
     # the clause begins with the subject "it", which is replaced
     before, after, _ = proof_scores(proof)
     errors = ErrorComparison(proof.closed, proof.closed_reason, before.rms, after.rms)
     predicate = closed_share_text(investigation.campaign.channels, errors).removeprefix("it ")
-    if proof.closed.has_grown:
-        subject = "With it" if is_named else "With the best hypothesis, which is not named,"
-    else:
-        subject = "It" if is_named else "The best hypothesis, which is not named,"
-    return f"{subject} {predicate}."
+    if not isfinite(before.chi_square_per_sample):
+        return f"{subject} {predicate}."
+    level_before, level_after = noise_levels(proof)
+    return f"{subject} {predicate}: {level_before} times the noise before, {level_after} after."
 
 
 def noise_levels(proof: Proof) -> tuple[str, str]:
@@ -208,7 +171,7 @@ def remainders_sentence(verdict: Verdict) -> str:
         if remainder.frequency > 0.0:
             phrase += f", swinging at {number(remainder.frequency)} Hz"
         phrases.append(phrase)
-    return f"The remainder beyond the noise: {'; '.join(phrases)}." if phrases else ""
+    return f"Left beyond the noise: {'; '.join(phrases)}." if phrases else ""
 
 
 def parameters_sentence(effects: Iterable[NamedEffect]) -> str:
@@ -221,4 +184,4 @@ def parameters_sentence(effects: Iterable[NamedEffect]) -> str:
             phrases.append(f"{parameter_text(parameter)} {with_unit} ({interval})")
     if not phrases:
         return ""
-    return f"Its size: {'; '.join(phrases)}; 90 % intervals in brackets."
+    return f"Size: {'; '.join(phrases)}; 90 % intervals in brackets."

@@ -1,7 +1,7 @@
 """The tables of the report on a verdict: effects, experiments, gates and hypotheses."""
 
 from collections.abc import Mapping
-from math import isfinite, isnan
+from math import isfinite, isnan, log
 from typing import NamedTuple
 
 from discrepancy.judgement.hypotheses import probability_text
@@ -167,7 +167,7 @@ def next_experiments_table(verdict: Verdict) -> Table:
     columns: list[RecordColumn[Experiment]] = [
         text_cells("test", lambda experiment: experiment.description),
         text_cells("why", lambda experiment: experiment.reason),
-        number_cells("information", lambda experiment: f"{experiment.information:.2f}", "nat"),
+        number_cells("information", lambda experiment: f"{bits(experiment):.2f}", "bit"),
         number_cells("cost", lambda experiment: f"{experiment.cost:g}", "trials"),
     ]
     return table_of_records(
@@ -176,6 +176,11 @@ def next_experiments_table(verdict: Verdict) -> Table:
         title="Proposed tests, best first",
         caption="Cost is relative to one more trial of a kind that was done already.",
     )
+
+
+def bits(experiment: Experiment) -> float:
+    """Return the information of a proposed test in bits: 1 decides between two equals."""
+    return experiment.information / log(2.0)
 
 
 def gates_table(verdict: Verdict) -> Table:

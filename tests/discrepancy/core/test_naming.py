@@ -92,7 +92,7 @@ class NamedCase:
     hidden: tuple[HiddenEffect, ...]
     laws: ModelPatch
     words: frozenset[str]
-    """Names of the group, or words of the sentence, that the case asks for."""
+    """Names of the group, or words of the conclusion and its reasons, that the case asks for."""
     verdict: Verdict
     set_probabilities: dict[tuple[str, ...], float]
     fitted_effects: tuple[str, ...]
@@ -201,9 +201,9 @@ def test_a_group_has_the_effects_that_the_data_cannot_distinguish(label, seed):
 
 
 @each_case(must_be(VerdictKind.UNEXPLAINED))
-def test_an_unexplained_gap_has_its_reason_in_the_sentence(label, seed):
+def test_an_unexplained_gap_has_its_reason(label, seed):
     case = concluded(label, seed)
-    assert all(words in case.verdict.sentence for words in case.words)
+    assert all(words in case.verdict.text for words in case.words)
 
 
 @each_case(must_be(VerdictKind.NOTHING_MISSING))
@@ -366,8 +366,8 @@ def test_without_a_noise_record_the_sentence_says_so(offset, noise, kind):
     """Neither that nothing is missing nor that the name is all can be said of an absolute fit."""
     verdict, _, _ = conclusion_on_an_offset(offset, noise)
     assert verdict.kind is kind, verdict.sentence
-    assert ("No noise record" in verdict.sentence) is (noise is None)
-    assert ("record" in verdict.sentence) is (noise is None)
+    assert ("No noise record" in verdict.text) is (noise is None)
+    assert ("record" in verdict.text) is (noise is None)
 
 
 @pytest.mark.parametrize(("offset", "noise", "kind"), CLOSED_FORM_CASES)
@@ -640,7 +640,7 @@ def test_a_verdict_says_last_which_look_alikes_cannot_be_tested(kind):
     )
     *others, last = [effect.name for effect in untested]
     told = f"Not excluded, because they cannot be tested here: {', '.join(others)} and {last}."
-    sentence = verdict_with_untested_effects(verdict, STATIC_SETTING, kit.CATALOGUE).sentence
+    sentence = verdict_with_untested_effects(verdict, STATIC_SETTING, kit.CATALOGUE).text
     assert sentence == f"A gain is wrong. {told}"
 
 
@@ -649,14 +649,14 @@ def test_what_can_be_tested_was_compared():
     (cubic,) = kit.chosen("cubic_stiffness")
     assert "cubic_stiffness" in kit.chosen("sensor_saturation")[0].confusable
     assert cubic.unavailable(STATIC_SETTING) is None
-    sentence = verdict_with_untested_effects(named, STATIC_SETTING, kit.CATALOGUE).sentence
+    sentence = verdict_with_untested_effects(named, STATIC_SETTING, kit.CATALOGUE).text
     assert cubic.name not in sentence
 
 
 def test_an_effect_that_does_not_act_on_these_trials_is_not_mentioned():
     """`Washout` looks like a saturated sensor, but acts in flight alone."""
     named = verdict_on("sensor_saturation")
-    sentence = verdict_with_untested_effects(named, STATIC_SETTING, kit.CATALOGUE).sentence
+    sentence = verdict_with_untested_effects(named, STATIC_SETTING, kit.CATALOGUE).text
     assert "washout" in kit.chosen("sensor_saturation")[0].confusable
     assert "washout" not in sentence
 

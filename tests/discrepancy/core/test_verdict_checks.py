@@ -19,6 +19,7 @@ from discrepancy.judgement.sensor_estimates import sensor_estimates
 from discrepancy.judgement.verdict_checks import check_against_trials, far_held_out_records, unfitted_records
 from discrepancy.report.figures import ReportInput
 from discrepancy.report.printed import verdict_lines
+from discrepancy.report.verdict_sentences import error_sentence
 from discrepancy.system.lumped_model import LumpedModel
 from discrepancy.verdict import VerdictKind
 from discrepancy.verdict_folder import write_verdict_folder
@@ -96,7 +97,7 @@ def test_a_held_out_trial_far_off_vetoes_that_nothing_is_missing():
         trial.values[:] += off
     verdict = investigate(campaign, MODEL, chosen("coulomb_friction"), thorough=False).verdict
     assert verdict.kind is VerdictKind.UNEXPLAINED, verdict.sentence
-    assert "not those held out: it misses x in 'second' by" in verdict.sentence
+    assert "It misses x in 'second' by" in verdict.reasons
     assert verdict.effects == verdict.resembles == ()
 
 
@@ -161,12 +162,10 @@ def test_a_parameter_that_the_model_moves_beyond_two_deviations_is_found(stiffer
 
 def test_moved_parameters_are_named_with_their_figures(stiffer_than_stated):
     problem, (moved,) = stiffer_than_stated
-    told = (
-        f"the model moves 'stiffness' from 1 ± 0.004 to {moved.value:.4g} ({moved.deviations:.1f} deviations)"
-    )
+    told = f"the fit moves stiffness from 1 ± 0.004 to {moved.value:.4g} ({moved.deviations:.1f} deviations)"
     found = investigate(problem.campaign, problem.model, chosen("load_cell"), thorough=False)
     assert told in moved_sentence([moved])
-    assert told in found.verdict.sentence
+    assert told in found.verdict.text
 
 
 def test_gains_and_zeros_are_named_too():
@@ -309,7 +308,7 @@ def test_a_verdict_below_detectability_has_the_probability_that_nothing_is_missi
     printed = "\n".join(map(str, verdict_lines(ReportInput(found, ORIGIN))))
 
     assert found.verdict.probability == none.probability < 0.95
-    assert "\nProbability that nothing is missing 0." in printed
+    assert "(probability that nothing is missing 0." in printed
 
 
 @pytest.mark.parametrize("case", ["below limit", "group"])
@@ -340,15 +339,15 @@ def test_the_share_of_the_proof_is_that_of_the_residuals(case):
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_a_sentence_without_a_full_name_has_share_and_errors_of_the_proof(case):
+def test_the_sentence_on_errors_has_those_of_the_proof(case):
     searched = stored_case(case)
-    verdict = searched.stored.verdict
-    if searched.is_compared and verdict.kind in (VerdictKind.NAMED_IN_PART, VerdictKind.UNEXPLAINED):
+    if searched.is_compared:
         errors = rms_errors_text(
             searched.after.channels, searched.scores_before.rms, searched.scores_after.rms
         )
-        assert percent_with_interval(searched.stored.proof.closed) in verdict.sentence
-        assert errors in verdict.sentence
+        sentence = error_sentence(searched.found)
+        assert percent_with_interval(searched.stored.proof.closed) in sentence
+        assert errors in sentence
 
 
 def test_the_campaigns_are_of_each_kind_that_these_tests_tell_apart():
@@ -381,7 +380,7 @@ def test_a_hypothesis_with_which_the_error_grows_is_not_named(checked_outcome):
     verdict = checked_outcome.verdict
     assert verdict.kind is VerdictKind.UNEXPLAINED
     assert verdict.effects == verdict.resembles == ()
-    assert "larger (rms of" in verdict.sentence
+    assert "larger (rms of" in verdict.reasons
 
 
 def test_of_a_hypothesis_with_which_the_error_grows_nothing_is_applied(checked_outcome, drag_on_rig):

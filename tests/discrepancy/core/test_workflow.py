@@ -188,7 +188,7 @@ def test_exact_readings_without_a_noise_record_have_nothing_missing_and_the_sent
     channels = {name: replace(channel, noise=None) for name, channel in exact.channels.items()}
     found = judged(replace(exact, trials=exact.fitted, channels=channels), thorough=False)
     assert found.verdict.kind is VerdictKind.NOTHING_MISSING
-    assert "No noise record" in found.verdict.sentence
+    assert "No noise record" in found.verdict.text
 
 
 def test_a_gain_far_from_its_prior_is_remarked_on():
@@ -331,8 +331,8 @@ def test_a_gain_that_only_keeps_parameters_near_their_priors_is_no_name(gain_or_
 
 
 def test_parameters_far_from_their_priors_are_told_with_what_data_cannot_distinguish(gain_or_parameters):
-    assert "('mass' 11.0, 'stiffness' 1" in gain_or_parameters.sentence
-    assert "with one channel, these data cannot distinguish the two" in gain_or_parameters.sentence
+    assert "('mass' 11.0, 'stiffness' 1" in gain_or_parameters.text
+    assert "with one channel, these data cannot distinguish the two" in gain_or_parameters.text
 
 
 @once
@@ -375,7 +375,7 @@ def test_the_law_of_an_event_has_its_coefficient_and_its_beginnings(verdict_with
     told = "acts from 4.137 s on in 'first'; from 2.221 s on in 'second'."
     assert law.coefficient == pytest.approx(0.4, rel=0.03)
     assert law.windows == (Window("first", 4.137), Window("second", 2.221))
-    assert verdict_with_event.sentence.endswith(told)
+    assert verdict_with_event.text.endswith(told)
 
 
 @pytest.mark.parametrize("first_event", [1, 2], ids=["an event of a held-out trial alone", "no event"])

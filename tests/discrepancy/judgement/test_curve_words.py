@@ -24,20 +24,35 @@ DISPLACEMENTS = np.linspace(-0.02, 0.02, 49)
         ),
         (
             1e6 * DISPLACEMENTS**3,
-            "it stiffens, growing about as the power 3 of the displacement",
+            "it stiffens by 8 N at 20 mm, about as the power 3 of the displacement",
         ),
         (
             -1e5 * np.maximum(DISPLACEMENTS, 0.0) ** 2,
-            "it softens, growing about as the power 2 of the displacement at positive displacements only",
+            "it softens by 40 N at 20 mm, about as the power 2 of the displacement, at positive "
+            "displacements only",
+        ),
+        (
+            60.0 * np.maximum(DISPLACEMENTS - 0.01, 0.0) - 9.0 * DISPLACEMENTS,
+            "apart from a line of −9 N/m, as an error of the stiffness gives, it is zero from "
+            "−20 mm to 10 mm, with a slope of 60 N/m above",
         ),
         (
             np.where(DISPLACEMENTS < -0.005, -0.08, -40.0 * np.maximum(DISPLACEMENTS - 0.0075, 0.0)),
             "it is zero from −20 mm to 7.5 mm, with a slope of −40 N/m above",
         ),
-        (80.0 * DISPLACEMENTS, "it grows in proportion to the displacement"),
-        (0.5 * np.sign(DISPLACEMENTS), "it is nearly constant"),
+        (80.0 * DISPLACEMENTS, "it is proportional to the displacement, 80 N/m"),
+        (0.5 * np.sign(DISPLACEMENTS), "it is nearly constant, at most 0.5 N"),
     ],
-    ids=["stop", "play", "cubic", "one-sided", "small on one side", "linear", "constant"],
+    ids=[
+        "stop",
+        "play",
+        "cubic",
+        "one-sided",
+        "stop beside a line",
+        "small on one side",
+        "linear",
+        "constant",
+    ],
 )
 def test_a_curve_is_told_by_its_shape(forces, words):
     assert curve_in_words(TableStiffness("p", tuple(DISPLACEMENTS), tuple(forces)), "N") == words
@@ -57,8 +72,11 @@ def test_the_motion_of_a_moment_is_told_in_radians():
             np.sign(VELOCITIES) * (0.4 + 0.6 * np.exp(-((VELOCITIES / 0.1) ** 2))),
             "it is largest near rest, and falls to 0.4 N at 0.5 m/s",
         ),
-        (np.sign(VELOCITIES), "it is nearly constant"),
-        (3.0 * VELOCITIES * np.abs(VELOCITIES), "it grows about as the power 2 of the velocity"),
+        (np.sign(VELOCITIES), "it is nearly constant, at most 1 N"),
+        (
+            3.0 * VELOCITIES * np.abs(VELOCITIES),
+            "it grows to 0.75 N at 0.5 m/s, about as the power 2 of the velocity",
+        ),
     ],
     ids=["Stribeck", "dry", "drag"],
 )

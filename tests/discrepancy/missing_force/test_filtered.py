@@ -442,7 +442,7 @@ def test_a_verdict_has_the_windows_in_which_something_acts(tmp_path):
     problem = problem_of(case)
     verdict = investigate(problem.campaign, problem.model, FEW).verdict
     windows = [window for window in verdict.windows if not window.with_effect]
-    assert gap_times_sentence(windows) in verdict.sentence
+    assert gap_times_sentence(windows) in verdict.text
     for window, moments in zip(windows, case.windows, strict=True):
         assert_window_is_at(window, moments, 0.01 * case.length)
 

@@ -37,9 +37,9 @@ from discrepancy.missing_force.port_force import (
 )
 from discrepancy.missing_force.shares import ForceShares
 from discrepancy.model_choice import load_model
-from discrepancy.report.figures import missing_force_figure
+from discrepancy.report.force_figure import missing_force_figure
 from discrepancy.report.sizes import size_sentence
-from discrepancy.report.verdict_sentences import force_sentence
+from discrepancy.report.verdict_sentences import force_sentence, left_sentence
 from discrepancy.search.strategy import Search
 from discrepancy.search.whole_search import search
 from discrepancy.system.lumped_model import LumpedModel
@@ -284,7 +284,7 @@ def test_a_report_opens_with_the_missing_force(friction_on_rail):
     told = friction_on_rail.verdict.force
     sentence = force_sentence(told)
     assert sentence.startswith(f"A force of {told.rms:.3g} N (rms) is missing at rail, at most ")
-    assert "Beside Coulomb friction" in sentence
+    assert left_sentence(told).startswith("Left beside Coulomb friction: ")
 
 
 def test_a_speed_that_is_a_rounding_error_is_told_as_zero(friction_on_rail):
@@ -298,8 +298,8 @@ def test_the_missing_force_is_drawn_with_two_deviations_about_it(friction_on_rai
     course = course_of_largest_force(friction_on_rail)
     largest = int(np.argmax(np.abs(course.force)))
     edge = course.time[largest], course.force[largest] + 2.0 * course.deviation[largest]
-    band = axes[2].collections[0].get_paths()[0].vertices
-    assert len(axes) == 6
+    band = axes[3].collections[0].get_paths()[0].vertices
+    assert len(axes) == 4
     assert np.isclose(band, edge).all(axis=1).any()
 
 
@@ -540,7 +540,7 @@ def test_a_force_that_acts_otherwise_than_recorded_follows_the_input(acting, var
     assert missing.at_port.ordered_by == (variable,)
     assert missing.at_port.orders[variable] > 0.6
     labels = [axes.get_xlabel() for axes in missing_force_figure(missing).axes]
-    assert labels[1] == variable.removeprefix("the ")
+    assert labels[0] == variable.removeprefix("the ")
 
 
 def test_a_spring_behind_a_damper_follows_the_relaxed_displacement():

@@ -37,15 +37,16 @@ from discrepancy.report.decidability_text import (
     group_lines,
 )
 from discrepancy.report.figures import ReportInput, report_figures
-from discrepancy.report.page import missing_effects_text, verdict_card, verdict_page
+from discrepancy.report.levels import answers, probability_of_force, probability_of_port
+from discrepancy.report.page import verdict_page
 from discrepancy.report.printed import check_lines
 from discrepancy.report.residual_figures import gauge_places, planform_figure
 from discrepancy.report.sizes import si_sizes
 from discrepancy.report.tables import detectable_sizes_table, parameter_rows
-from discrepancy.report.text import formula, number
-from discrepancy.report.verdict_sentences import error_sentence, headline, proof_scores, remainders_sentence
+from discrepancy.report.text import added_label, formula, number
+from discrepancy.report.verdict_sentences import error_sentence, proof_scores, remainders_sentence
 from discrepancy.system.wing_model import WingModel
-from discrepancy.verdict import NotFitted, RemainderEstimate, Verdict, VerdictKind
+from discrepancy.verdict import NotFitted, RemainderEstimate, VerdictKind
 from discrepancy.verdict_folder import check_verdict_folder, write_verdict_folder
 from fe.runtime import patch as patches
 from fe.runtime.patch import PowerDamping, SensorDrift
@@ -114,25 +115,19 @@ def test_a_verdict_begins_with_what_is_missing_how_large_and_what_is_left(drag, 
     """Without intervals the size is told by its parameters."""
     closed, force = percent_with_interval(drag.proof.closed), drag.verdict.force
     opening = (
-        f">Quadratic aerodynamic damping at {force.port} is missing; {number(force.rms)} N (rms)",
-        f"probability {probability_text(drag.verdict.probability)}.<",
+        f'class="card">{drag.verdict.sentence} Size: ',
         f">{closed}<",
-        f">{headline(drag.verdict)}<",
-        "Its size: ",
-        f"It explains {closed} of the mean square error in ",
+        "Is something missing?",
+        f">yes: a force of {number(force.rms)} N (rms), at most ",
+        f">at {force.port}<",
+        f">{force.followed_percent} % of its variance<",
+        "Which law is it?",
+        "<details>",
     )
     places = [page.index(words) for words in opening]
     assert places == sorted(places)
-
-
-def test_the_card_of_a_verdict_says_what_is_missing_where_how_large_and_how_sure(drag, page):
-    """The other sentences are unfolded behind it."""
-    force, probability = drag.verdict.force, probability_text(drag.verdict.probability)
-    missing = f"Quadratic aerodynamic damping at {force.port} is missing"
-    card = f"{missing}; {number(force.rms)} N (rms) at {force.port}"
-    places = [page.index(mark) for mark in ('class="card"', 'class="highlights"', "<details>", "<table")]
-    assert f'class="card">{card}; probability {probability}.<' in page
-    assert places == sorted(places)
+    name = f"quadratic aerodynamic damping at {force.port}"
+    assert drag.verdict.sentence == f"The model lacks {name} (probability > 0.999)."
 
 
 def test_a_verdict_has_the_scores_of_its_held_out_trials(drag, page):
@@ -153,7 +148,7 @@ def test_gates_say_what_they_compare(drag, page):
 
 def test_a_group_is_no_name(drag):
     page = page_of(drag, kind=VerdictKind.GROUP)
-    assert "The best hypothesis, which is not named, explains" in page
+    assert f"is taken away by {added_label(drag)}, which is not named" in page
 
 
 def test_a_proof_without_a_gap_says_so(drag):
@@ -164,8 +159,9 @@ def test_a_proof_without_a_gap_says_so(drag):
 
 def test_an_error_that_grew_is_said_to_be_made(drag):
     larger = replace(drag.proof.closed, value=-0.2, low=-0.3, high=-0.1)
-    page = page_of(replace(drag, proof=replace(drag.proof, closed=larger)))
-    assert "makes the error in" in page
+    grown = replace(drag, proof=replace(drag.proof, closed=larger))
+    assert "of the mean square error in held-out trials is added" in page_of(grown)
+    assert error_sentence(grown).startswith("It makes the error in")
 
 
 def test_an_unexplained_gap_without_a_proof_has_the_consistency_and_no_share(drag):
@@ -175,21 +171,34 @@ def test_an_unexplained_gap_without_a_proof_has_the_consistency_and_no_share(dra
     unexplained = {"kind": VerdictKind.UNEXPLAINED, "effects": (), "gates": gates, "force": None}
     page = page_of(replace(drag, proof=None), **unexplained)
     assert "of the mean square error" not in page
-    assert "p of the consistency; a fit has at least 0.001" in page
+    assert "<td>p = 2e-05 that it is noise</td>" in page.replace(' class="name"', "")
 
 
-def test_the_first_screen_says_what_a_force_without_a_name_follows(drag):
-    force = drag.verdict.force
-    assert force.ordered_by == ("velocity",)
-    follows = f"{force.followed_percent} % of its variance follows velocity"
-    unexplained = replace(drag.verdict, kind=VerdictKind.UNEXPLAINED, effects=())
-    assert follows in verdict_card(unexplained)
-    assert follows not in verdict_card(drag.verdict)
+def test_the_first_screen_says_what_a_force_depends_on(drag):
+    dependence = next(row for row in answers(drag.verdict) if row.question == "What does it depend on?")
+    assert drag.verdict.force.ordered_by == ("velocity",)
+    assert dependence.text == "the velocity"
+    assert dependence.certainty == f"{drag.verdict.force.followed_percent} % of its variance"
+
+
+def test_the_certainty_of_a_port_is_that_among_the_ports(drag):
+    force = replace(drag.verdict.force, port="a", evidence={"a": 20.0, "b": 18.0, "c": -5.0})
+    assert probability_of_port(force) == pytest.approx(1.0 / (1.0 + np.exp(-2.0)), rel=1e-6)
+    assert probability_of_force(force) > 0.999
+    where = answers(replace(drag.verdict, force=replace(force, port="b")))[1]
+    assert where == ("Where?", "at b", "by its law; a force without a law shows more at a")
+
+
+def test_where_nothing_is_missing_there_is_one_answer(drag):
+    nothing = replace(drag.verdict, kind=VerdictKind.NOTHING_MISSING, probability=0.97)
+    (answer,) = answers(nothing)
+    assert answer.text == "no"
+    assert answer.certainty == "probability that nothing is missing 0.970"
 
 
 def test_an_investigation_shows_its_verdict_and_the_missing_force_in_a_notebook(drag):
     text = drag._repr_html_()
-    assert drag.verdict.sentence in html.unescape(text)
+    assert drag.verdict.text in html.unescape(text)
     assert "quadratic aerodynamic damping" in text.lower()
     panels = drag.plot()
     assert len(panels) == len(drag.missing.courses[:6])
@@ -212,7 +221,7 @@ def test_members_of_a_group_stand_apart_and_first(drag):
         drag, kind=VerdictKind.GROUP, effects=(effect, rival), hypotheses=hypotheses,
         group=(effect.identifier, rival.identifier),
     )  # fmt: skip
-    assert f"Quadratic aerodynamic damping at {effect.place} or a rival at {effect.place}" in text
+    assert ">one of 2<" in text
     text = re.sub(' data-of="[^"]*"| class="name"', "", text)  # how cells look
     members = re.findall(r"<td>(\d?)</td><td>(.*?)</td>", text[text.index("The members of the group") :])
     assert [row for row in members if row[0]] == [("1", effect.name), ("2", "a rival")]
@@ -389,35 +398,6 @@ def test_rounding_keeps_values_within_a_twentieth_of_their_spread(value, spread)
     assert abs(float(text) - value) <= 0.051 * spread + 1e-9 * abs(value)
 
 
-def test_the_card_of_a_group_with_long_names_says_how_many_hypotheses(drag):
-    (effect,) = drag.verdict.effects
-    names = {"short": ("play", "drag"), "long": ("a law with a long name", "another law with a name as long")}
-    cards = {}
-    for length, (first, second) in names.items():
-        effects = (replace(effect, identifier="a", name=first), replace(effect, identifier="b", name=second))
-        verdict = Verdict(VerdictKind.GROUP, "", 0.97, 12.0, effects=effects, group=("a", "b"))
-        cards[length] = missing_effects_text(verdict)
-    assert cards["short"] == f"play at {effect.place} or drag at {effect.place}"
-    assert cards["long"] == "one of 2 hypotheses"
-
-
-def test_a_headline_has_one_probability():
-    named = Verdict(VerdictKind.NAMED, "The model lacks drag (probability 0.998).", 0.998, 12.0)
-    nothing = Verdict(VerdictKind.NOTHING_MISSING, "The model explains the data.", 0.97, 12.0)
-    broken = Verdict(VerdictKind.DATA_ERROR, "Channel x is clipped.", float("nan"), float("nan"))
-    assert headline(named).count("probability") == 1
-    assert headline(nothing) == "The model explains the data (probability that nothing is missing 0.970)."
-    assert headline(broken) == "Channel x is clipped."
-
-
-def test_a_name_that_holds_its_identifier_is_said_once(drag):
-    (effect,) = drag.verdict.effects
-    flow = replace(effect, identifier="outflow", name="outflow by a power of the level")
-    sentence = f"The nearest is outflow; {flow.name} closes 74 %."
-    verdict = replace(drag.verdict, sentence=sentence, effects=(flow,), hypotheses=())
-    assert headline(verdict).startswith(f"The nearest is {flow.name}; {flow.name} closes 74 %")
-
-
 @pytest.fixture(scope="module")
 def strains():
     """Residuals of four channels that are the first gauges of a wing."""
@@ -454,18 +434,18 @@ def test_without_gauges_there_is_no_planform(strains):
 @pytest.mark.parametrize(
     ("kind", "primitive", "text"),
     [
-        ("rig", PowerDamping("slide", 0.5, 0.0, 0.0, 1.0, 1.0), "force 0.5000 N"),
+        ("rig", PowerDamping("slide", 0.5, 0.0, 0.0, 1.0, 1.0), "slide rubs with 0.5000 N"),
         ("rig", PowerDamping("slide", 0.5, 2.0, 0.0, 0.25, 1.0), "force 0.5000 N at 0.25 m/s"),
-        ("rig", patches.PowerStiffness("slide", 3.0, 3.0, 0, 0.01), "force 3 N at 0.01 m"),
+        ("rig", patches.PowerStiffness("slide", -3.0, 3.0, 0, 0.01), "slide softens by 3 N at 0.01 m"),
         ("rig", patches.PointMass(0.2, 0.4), "mass 0.200 kg at 0.4 m"),
         ("rig", patches.SensorGain("displacement", 0.02), ""),
         ("rig", SensorDrift("displacement", 0.002, 10.0), "amplitude 0.002 m"),
         ("rig", SensorDrift("leaf_strain", 0.002, 10.0), ""),
-        ("rig", PowerDamping("elsewhere", 0.5, 0.0, 0.0, 1.0, 1.0), "force 0.500 N or N m"),
+        ("rig", PowerDamping("elsewhere", 0.5, 0.0, 0.0, 1.0, 1.0), "elsewhere rubs with 0.500 N or N m"),
         ("tank", PowerDamping("outlet", 0.5, 0.5, 0.0, 2.0, 1.0), "flow 0.500 m/s times capacity at 2 m"),
         ("tank", patches.Overflow("outlet", 0.5, 1.5, 3.0, 2.0), "flow 0.500 m/s times capacity, level 3 m"),
-        ("wing", PowerDamping("root", 0.5, 0.0, 0.0, 1.0, 1.0), "moment 0.500 N m"),
-        ("wing", PowerDamping("tip", 0.5, 0.0, 0.0, 1.0, 1.0), "force 0.500 N"),
+        ("wing", PowerDamping("root", 0.5, 0.0, 0.0, 1.0, 1.0), "root rubs with 0.500 N m"),
+        ("wing", PowerDamping("tip", 0.5, 0.0, 0.0, 1.0, 1.0), "tip rubs with 0.500 N"),
     ],
 )
 def test_sizes_have_the_unit_of_their_port_state_or_channel(drag, coarse_patch_arrays, kind, primitive, text):

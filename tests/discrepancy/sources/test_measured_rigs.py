@@ -136,15 +136,15 @@ def test_effects_that_make_the_held_out_record_of_the_tanks_worse_are_not_named(
     effects = chosen("outflow", "overflow", "logger_clock")
     found = investigate(*rig("two_tanks", tmp_path), effects, thorough=False)
     assert found.verdict.kind is VerdictKind.UNEXPLAINED
-    assert "the error in one trial that was not fitted larger" in found.verdict.sentence
-    assert "no effect is named, and there is nothing to apply" in found.verdict.sentence
+    assert "the error in one trial that was not fitted larger" in found.verdict.text
+    assert "no effect is named, and there is nothing to apply" in found.verdict.text
 
 
 def test_the_place_of_what_a_pendulum_lacks_is_said(tmp_path):
     effects = chosen("coulomb_friction", "quadratic_damping")
     found = investigate(*rig("pendulum", tmp_path), effects, thorough=False)
     assert found.verdict.kind is VerdictKind.UNEXPLAINED
-    assert "is missing at 'pivot'; " in found.verdict.sentence
+    assert "is missing at pivot, and no law of the catalogue explains it: " in found.verdict.sentence
     assert found.proof is None or found.proof.closed.value < 0.5
 
 
