@@ -135,8 +135,6 @@ def write_at(path: Path, data: bytes, position: int) -> None:
 
     Parameters
     ----------
-    path : Path
-        The file.
     data : bytes
         The bytes.
     position : int
@@ -165,8 +163,6 @@ def refuse_existing(path: Path | None, *, replace: bool, option: str = "--out") 
     ----------
     path : Path, optional
         The file to write.
-    replace : bool
-        Whether an existing file may be replaced.
     option : str
         The option that gives the path, for the message.
 
@@ -269,8 +265,6 @@ def read_members(folder: Path, suffixes: Collection[str] = ()) -> dict[str, byte
 
     Parameters
     ----------
-    folder : Path
-        The path of the folder.
     suffixes : collection of str
         The suffixes of the files to read, such as ".py"; all files by default.
     """
@@ -289,8 +283,6 @@ def write_members(folder: Path, members: Mapping[str, bytes]) -> None:
 
     Parameters
     ----------
-    folder : Path
-        The path of the folder.
     members : mapping of str to bytes
         The contents by relative path.
     """

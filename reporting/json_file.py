@@ -35,8 +35,6 @@ def read_json(path: Path | str, error: type[Exception], *, what: str = "file") -
     ----------
     path : Path or str
         The file; UTF-8, with or without a byte order mark.
-    error : type of Exception
-        The exception to raise.
     what : str
         What the file should be, for the message: "patch".
 
@@ -56,8 +54,6 @@ def parse_json(
 
     Parameters
     ----------
-    content : bytes or str
-        The text of the file.
     source : str
         Where the text is from; begins the message.
     error : type of Exception

@@ -15,8 +15,6 @@ def read_text(
     ----------
     path : Path or str
         The path of the file.
-    error : type of Exception
-        The exception to raise.
     what : str
         What the file should be, for the message: "wing design".
     otherwise : str, optional
@@ -52,8 +50,6 @@ def decoded(
         The content of a file.
     subject : str
         The beginning of the message, such as "The wing design wing.toml".
-    error : type of Exception
-        The exception to raise.
     otherwise : str, optional
         The encoding of bytes that are not UTF-8.
 
@@ -85,8 +81,6 @@ def check_nesting(content: object, subject: str, error: type[Exception]) -> None
         The dictionaries and lists of a parsed document.
     subject : str
         The beginning of the message.
-    error : type of Exception
-        The exception to raise.
     """
     level = [content]
     for _ in range(DEEPEST_NESTING):

@@ -3,13 +3,12 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from calibration.paper.load_test import ParticlePosterior, StaticCalibration
+from calibration.paper.load_test import Moments, ParticlePosterior, StaticCalibration
 from calibration.result.record import Calibration
 from calibration.static.experiments import HALF_WIDTH_95
 from calibration.static.posterior import ScalarPosterior
@@ -68,13 +67,6 @@ class PublishedQuantity:
 
 PAPER = {name: PublishedQuantity(**entry) for name, entry in WORDS.content["paper"].items()}
 """The quantities of Table 1 by name."""
-
-
-class Moments(NamedTuple):
-    """Mean and standard deviation [SI]."""
-
-    mean: float
-    standard_deviation: float
 
 
 @dataclass(frozen=True)

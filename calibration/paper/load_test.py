@@ -142,8 +142,6 @@ def particle_filter(
 
     Parameters
     ----------
-    curve : StiffnessCurve
-        The tip stiffness k(e) [N/m].
     prior : GaussianPrior, optional
         The prior of e; the paper's by default.
     particle_count : int
@@ -233,19 +231,19 @@ def _pair_density(
     return kernel_density(factors, normal_reference_bandwidth(factors), window)
 
 
-class _Moments(NamedTuple):
-    """Mean and standard deviation."""
+class Moments(NamedTuple):
+    """Mean and standard deviation, in SI units."""
 
     mean: float
     standard_deviation: float
 
 
-def _weighted_moments(weight: Float, value: Float) -> _Moments:
+def _weighted_moments(weight: Float, value: Float) -> Moments:
     """Return the moments of values (N,) with weights (N,) that sum to 1."""
     # Pairwise sums rather than dot products, whose last bits depend on the number of BLAS threads.
     mean = float(np.sum(weight * value))
     variance = float(np.sum(weight * (value - mean) ** 2))
-    return _Moments(mean, math.sqrt(variance))
+    return Moments(mean, math.sqrt(variance))
 
 
 @dataclass(frozen=True, eq=False)
@@ -254,8 +252,6 @@ class StaticCalibration:
 
     Attributes
     ----------
-    curve : StiffnessCurve
-        The tip stiffness k(e) [N/m].
     prior : GaussianPrior
         The prior p(e).
     particle : ParticlePosterior

@@ -81,8 +81,6 @@ def pair_log_likelihoods(
 
     Parameters
     ----------
-    curve : StiffnessCurve
-        The tip stiffness k(e) [N/m].
     young_modulus_factor : (N,) array
         The values of e.
     measure : {"displacement", "load", "ratio"}

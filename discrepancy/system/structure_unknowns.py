@@ -3,7 +3,7 @@
 from calibration.result.record import ParameterPrior
 from discrepancy.campaign.records import FloatArray
 from discrepancy.system.linear_system import SolvedStructure
-from fe.runtime.changeable import ChangedModes
+from fe.runtime.changed_structure import ChangedModes
 from fe.runtime.reduced import ReducedModel
 
 DEVIATION = 0.25

@@ -27,11 +27,8 @@ from discrepancy.system.system_model import SystemModel
 from discrepancy.system.system_state import PatchedTrial, SystemState
 from discrepancy.system.time_history import RecordedHistory
 from fe.runtime import patch as changes
-from fe.runtime.changeable import (
-    KEPT_SUBSPACES,
-    ChangeableModel,
-    ChangedStructure,
-)
+from fe.runtime.changeable import KEPT_SUBSPACES, ChangeableModel
+from fe.runtime.changed_structure import ChangedStructure, compliance_gains
 from fe.runtime.patch import (
     INTERNAL_FORCES,
     SENSORS,
@@ -491,7 +488,7 @@ class StructureModel(SystemModel):
             tuple(self.prior_mean(campaign).tolist()), losses=(0.0,) * len(self.regions)
         )
         # (support motions, loads + modes)
-        gains = self.model.compliance_gains(self._input_vector(state, {}))
+        gains = compliance_gains(self.model, self._input_vector(state, {}))
         largest_gains = gains.max(axis=1, initial=0.0).tolist()
         motions = zip(self.model.supports, self.model.motions, strict=True)
         compliances = {

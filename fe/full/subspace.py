@@ -6,7 +6,8 @@ of a load, is then the Euclidean length. Orthogonality in these coordinates suff
 root of the condition number of X, about 1e5, and not from the condition number itself.
 """
 
-from collections.abc import Sequence
+from bisect import bisect_left
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from scipy import sparse
@@ -20,6 +21,8 @@ from .factorisation import Factorisation
 
 MOST_ITERATIONS = 100
 """Largest number of iterations of conjugate gradients."""
+LEAST_SINGULAR_VALUE = 1e-7
+"""Singular directions below this fraction of the largest singular value are not used."""
 
 
 def affine_product(
@@ -41,6 +44,39 @@ def project_terms(terms: FloatArray, directions: FloatArray) -> FloatArray:
     projected = directions.T @ terms @ directions
     # Rounding leaves the products slightly unsymmetric.
     return np.asarray(0.5 * (projected + projected.swapaxes(1, 2)))
+
+
+def fewest_directions(
+    snapshots: FloatArray, least: int, is_accurate: Callable[[FloatArray], bool]
+) -> FloatArray:
+    """Return as few leading singular directions of snapshots as are accurate.
+
+    The number is found by bisection, which assumes that accuracy improves with it.
+
+    Parameters
+    ----------
+    snapshots : (N, S) array
+        The snapshots, which are scaled to unit length.
+    least : int
+        The least number of directions.
+    is_accurate : callable
+        Returns whether directions (N, K) are accurate.
+
+    Returns
+    -------
+    (N, K) array
+        The directions; all of them if fewer are not accurate.
+    """
+    unit_snapshots = snapshots / np.linalg.norm(snapshots, axis=0)
+    directions, singular_values, _ = np.linalg.svd(unit_snapshots, full_matrices=False)
+    most_directions = int(np.sum(singular_values > LEAST_SINGULAR_VALUE * singular_values[0]))
+    direction_count = bisect_left(
+        range(most_directions),
+        True,
+        min(least, most_directions),
+        key=lambda count: is_accurate(directions[:, :count]),
+    )
+    return np.asarray(directions[:, :direction_count])
 
 
 def solve_near(

@@ -4,14 +4,18 @@
 are whitened, see `fe.full.subspace`.
 """
 
-from bisect import bisect_left
-from collections.abc import Callable
 from math import ceil
 from typing import NamedTuple
 
 import numpy as np
 
-from fe.full.subspace import OrthonormalBasis, ProjectedBasis, project_terms, solve_near
+from fe.full.subspace import (
+    OrthonormalBasis,
+    ProjectedBasis,
+    fewest_directions,
+    project_terms,
+    solve_near,
+)
 from fe.runtime.arrays import FloatArray
 from fe.runtime.errors import ReductionError
 from fe.runtime.reduced import ReducedModel
@@ -21,11 +25,9 @@ from reporting.progress import Stage
 from reporting.words import counted
 
 from .dual_solutions import dual_solutions
-from .model_fields import DesignFields, ModalReduction
-from .terms import ReductionTerms, State
+from .modal_basis import ModalReduction
+from .terms import STATES_PER_ROUND, ReductionTerms, State
 
-STATES_PER_ROUND = 4
-"""Full solutions in a round of the search, and states whose modes are refined together."""
 SEARCH_MARGIN = 0.5
 """The search continues to this fraction of the tolerance, so that the basis can be compressed."""
 INSPECTED_ONE_OF = 6
@@ -45,41 +47,6 @@ BASIS_DROP = 1e-7
 """Directions shorter than this fraction of the solutions of their round are dropped."""
 RESIDUAL_DROP = 1e-8
 """The same for images of the basis vectors under the stiffness terms, which span the residuals."""
-LEAST_SINGULAR_VALUE = 1e-7
-"""Singular directions below this fraction of the largest singular value are not used."""
-
-
-def fewest_directions(
-    snapshots: FloatArray, least: int, is_accurate: Callable[[FloatArray], bool]
-) -> FloatArray:
-    """Return as few leading singular directions of snapshots as are accurate.
-
-    The number is found by bisection, which assumes that accuracy improves with it.
-
-    Parameters
-    ----------
-    snapshots : (N, S) array
-        The snapshots, which are scaled to unit length.
-    least : int
-        The least number of directions.
-    is_accurate : callable
-        Returns whether directions (N, K) are accurate.
-
-    Returns
-    -------
-    (N, K) array
-        The directions; all of them if fewer are not accurate.
-    """
-    unit_snapshots = snapshots / np.linalg.norm(snapshots, axis=0)
-    directions, singular_values, _ = np.linalg.svd(unit_snapshots, full_matrices=False)
-    most_directions = int(np.sum(singular_values > LEAST_SINGULAR_VALUE * singular_values[0]))
-    direction_count = bisect_left(
-        range(most_directions),
-        True,
-        min(least, most_directions),
-        key=lambda count: is_accurate(directions[:, :count]),
-    )
-    return np.asarray(directions[:, :direction_count])
 
 
 class _ResidualFactors(NamedTuple):
@@ -107,12 +74,6 @@ class StaticReduction:
     ----------
     terms : ReductionTerms
         The full model, with n free unknowns.
-    design_fields : DesignFields
-        The fields of the reduced model that do not depend on a basis.
-    modal : ModalReduction
-        The modal basis of the structure.
-    stage : Stage
-        Advances after each state.
 
     Attributes
     ----------
@@ -122,15 +83,8 @@ class StaticReduction:
         The states of the full solutions, in the order of the search.
     """
 
-    def __init__(
-        self,
-        terms: ReductionTerms,
-        design_fields: DesignFields,
-        modal: ModalReduction,
-        stage: Stage,
-    ) -> None:
+    def __init__(self, terms: ReductionTerms, modal: ModalReduction, stage: Stage) -> None:
         self.terms = terms
-        self.design_fields = design_fields
         self.modal = modal
         self.stage = stage
         self.loads = terms.factors.whitened(terms.loads)
@@ -231,12 +185,40 @@ class StaticReduction:
             Orthonormal combinations of the N basis vectors.
         """
         terms = self.terms
+        structure = terms.structure
+        design = structure.design
+        modal = self.modal
+        # the inputs: parameters, losses, free masses and controls
+        nominal_values = structure.parameters | structure.masses | structure.controls
+        inputs = (
+            *structure.parameters,
+            *structure.regions,
+            *structure.masses,
+            *structure.controls,
+        )
+        # the static basis
         if directions is None:
             directions = np.eye(self.basis.vectors.shape[1])
         basis = self.basis.vectors @ directions
         displacements = self.basis.displacements @ directions
         residual = self._residual_factors(directions)
         return ReducedModel(
+            design_hash=structure.design_hash,
+            name=design.name,
+            regions=structure.regions,
+            parameters=tuple(structure.parameters),
+            masses=tuple(structure.masses),
+            controls=tuple(structure.controls),
+            control_units=tuple(structure.control_units.values()),
+            gauges=structure.gauges,
+            displacements=structure.displacements,
+            accelerations=structure.accelerations,
+            nominal=np.array([nominal_values.get(name, 0.0) for name in inputs], dtype=np.float64),
+            damping=np.array((design.damping.alpha, design.damping.beta)),
+            validity_box=np.array([structure.ranges[name] for name in inputs], dtype=np.float64),
+            stiffness_factors=terms.stiffness_factors,
+            load_factors=terms.load_factors,
+            dual_split=terms.splits,
             static_stiffness=project_terms(self.basis.stiffness, directions),
             static_load=self.loads.T @ basis,
             static_output=self.outputs.T @ basis,
@@ -249,11 +231,15 @@ class StaticReduction:
             dual_residual=self.duals.residual,
             dual_stiffness=self.duals.stiffness,
             dual_output=self.duals.output,
+            mode_count=modal.mode_count,
+            modal_stiffness=modal.stiffness,
+            modal_mass=modal.mass,
+            modal_load=modal.load,
+            modal_output=modal.output,
+            followed_shapes=modal.followed_shapes,
             cross_mass=np.stack(
-                [self.modal.basis.T @ (term @ displacements) for term in terms.structure.mass_terms]
+                [modal.basis.T @ (term @ displacements) for term in structure.mass_terms]
             ),
-            **self.design_fields,
-            **self.modal.fields,
         )
 
     def _residual_factors(self, directions: FloatArray) -> _ResidualFactors:

@@ -20,7 +20,8 @@ from scipy.linalg import eigh
 
 from fe.full.subspace import OrthonormalBasis, affine_product, solve_near
 from fe.runtime.arrays import FloatArray
-from fe.runtime.changeable import ChangeableModel, ChangedStructure
+from fe.runtime.changeable import ChangeableModel
+from fe.runtime.changed_structure import ChangedStructure, compliance_gains
 from fe.runtime.patch import (
     InterfaceCompliance,
     ModelPatch,
@@ -395,7 +396,7 @@ class _Columns:
         motion = self.structure.support_motions[number]
         reference = self.held_terms.reference
         vector = self._middle_vector(model)
-        compliance = gain / float(model.compliance_gains(vector)[number].max())
+        compliance = gain / float(compliance_gains(model, vector)[number].max())
         primitive = (
             InterfaceCompliance(motion.support, motion.motion, compliance)
             if motion.motion in INTERFACE_MOTIONS

@@ -40,7 +40,7 @@ class WholeColumns(NamedTuple):
 
 
 class PossibleChanges(NamedTuple):
-    """The changes of a structure that are none of a support."""
+    """The changes of a structure other than those of its supports."""
 
     masses: Sequence[MassCandidate]
     losses: Sequence[LossCandidate]
@@ -67,11 +67,11 @@ def model_on_columns(
         The terms of the structure whose supports yield.
     load_factors : (L, 2) array of int
         The loads of the reduced model, see `ReductionTerms.load_factors`. A load that acts on held
-        nodes alone is none of them.
+        nodes alone is not among them.
     whole : WholeColumns
         The columns.
     changes : PossibleChanges
-        The changes that are none of a support.
+        The changes other than those of supports.
     """
     columns = whole.columns
     factors = terms.load_factors.tolist()

@@ -7,7 +7,8 @@ import numpy as np
 from scipy import sparse
 
 from fe.runtime.arrays import FloatArray
-from fe.runtime.changeable import ChangeableModel, ChangedStructure
+from fe.runtime.changeable import ChangeableModel
+from fe.runtime.changed_structure import ChangedStructure
 
 from .terms import ReductionTerms
 

@@ -55,8 +55,6 @@ def dual_solutions(terms: ReductionTerms, outputs: FloatArray, stage: Stage) -> 
     ----------
     outputs : (n, O) array
         The outputs of the full model, whitened.
-    stage : Stage
-        Advances after each state.
 
     Raises
     ------

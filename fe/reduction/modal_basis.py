@@ -7,19 +7,18 @@ accuracy.
 """
 
 from collections.abc import Iterator
+from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg import eigh
 
 from fe.full.factorisation import most_compliant_modes
-from fe.full.subspace import ProjectedBasis, affine_product, project_terms
+from fe.full.subspace import ProjectedBasis, affine_product, fewest_directions, project_terms
 from fe.runtime.arrays import BoolArray, FloatArray
 from fe.runtime.errors import ReductionError
 from reporting.progress import Stage
 
-from .certified_basis import STATES_PER_ROUND, fewest_directions
-from .model_fields import ModalReduction
-from .terms import ModalState, ReductionTerms
+from .terms import STATES_PER_ROUND, ModalCoefficients, ReductionTerms
 
 START_ITERATIONS = 4
 """Number of inverse iterations that start the working basis."""
@@ -38,8 +37,28 @@ MOST_CORRECTIONS = 12
 """Largest number of Davidson corrections for one state."""
 
 
+class ModalReduction(NamedTuple):
+    """The modal basis of a structure, and what the reduced model has in it.
+
+    Attributes
+    ----------
+    basis : (n, Nm) array
+        The basis vectors on the free unknowns of the full model.
+    mode_count, stiffness, mass, load, output, followed_shapes
+        The fields `modal_stiffness` and so on of `fe.runtime.reduced_arrays.ReducedArrays`.
+    """
+
+    basis: FloatArray
+    mode_count: int
+    stiffness: FloatArray
+    mass: FloatArray
+    load: FloatArray
+    output: FloatArray
+    followed_shapes: FloatArray
+
+
 def projected_modes(
-    stiffness_terms: FloatArray, mass_terms: FloatArray, state: ModalState, count: int
+    stiffness_terms: FloatArray, mass_terms: FloatArray, state: ModalCoefficients, count: int
 ) -> tuple[FloatArray, FloatArray]:
     """Compute the lowest modes of a projected model in a state.
 
@@ -64,12 +83,7 @@ def projected_modes(
 
 
 def modal_reduction(terms: ReductionTerms, count: int, stage: Stage) -> ModalReduction:
-    """Make a basis for the lowest modes of a structure, and the modal fields of its reduced model.
-
-    Parameters
-    ----------
-    stage : Stage
-        Advances after each sampled state.
+    """Make a basis for the lowest modes of a structure, and project the structure on it.
 
     Raises
     ------
@@ -125,8 +139,8 @@ def _refine(terms: ReductionTerms, working: ProjectedBasis, mode_count: int, sta
 
 
 def _refine_states(
-    terms: ReductionTerms, working: ProjectedBasis, states: list[ModalState], mode_count: int
-) -> Iterator[ModalState]:
+    terms: ReductionTerms, working: ProjectedBasis, states: list[ModalCoefficients], mode_count: int
+) -> Iterator[ModalCoefficients]:
     """Extend a basis by Davidson's method until it holds the modes of all states.
 
     Yields each state as soon as its modes have converged. See `_davidson_corrections`.
@@ -150,7 +164,7 @@ def _refine_states(
 
 
 def _davidson_corrections(
-    terms: ReductionTerms, working: ProjectedBasis, states: list[ModalState], mode_count: int
+    terms: ReductionTerms, working: ProjectedBasis, states: list[ModalCoefficients], mode_count: int
 ) -> tuple[FloatArray, FloatArray]:
     """Return vectors that improve a basis for the modes of S states, and the relative residuals.
 
@@ -189,7 +203,7 @@ def _davidson_corrections(
 
 
 def _compressed_directions(
-    working: ProjectedBasis, states: list[ModalState], count: int
+    working: ProjectedBasis, states: list[ModalCoefficients], count: int
 ) -> FloatArray:
     """Return the fewest directions (k, Nm) of the working basis that keep all frequencies.
 
@@ -231,24 +245,14 @@ def _projected_on(
         followed_modes = most_compliant_modes(load[structure.followed_load], squares, shapes)
         followed_shapes = shapes[:, followed_modes].T
     output = np.concatenate((terms.outputs.T @ basis, structure.acceleration_output @ basis))
-    return ModalReduction(
-        basis,
-        {
-            "mode_count": count,
-            "modal_stiffness": stiffness,
-            "modal_mass": mass,
-            "modal_load": load,
-            "modal_output": output,
-            "followed_shapes": followed_shapes,
-        },
-    )
+    return ModalReduction(basis, count, stiffness, mass, load, output, followed_shapes)
 
 
-def _nominal_state(terms: ReductionTerms) -> ModalState:
+def _nominal_state(terms: ReductionTerms) -> ModalCoefficients:
     """Return the state with nominal parameters and masses, and without damage."""
     structure = terms.structure
     no_losses = np.zeros(len(terms.losses))
-    return ModalState(
+    return ModalCoefficients(
         stiffness=terms.theta((*structure.parameters.values(), *no_losses)),
         mass=np.array((1.0, *structure.masses.values())),
     )

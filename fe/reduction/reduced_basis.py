@@ -20,7 +20,6 @@ from reporting.progress import Progress, reporter
 
 from .certified_basis import StaticReduction
 from .modal_basis import modal_reduction
-from .model_fields import DesignFields
 from .terms import ReductionTerms, State
 
 
@@ -85,7 +84,7 @@ def reduce_structure(
     with progress.stage("Reducing the modes") as stage:
         modal = modal_reduction(terms, settings.mode_count, stage)
     with progress.stage("Reducing the statics") as stage:
-        static = StaticReduction(terms, _design_fields(terms), modal, stage)
+        static = StaticReduction(terms, modal, stage)
         history = static.search(settings)
         directions = static.compressed(settings.bound_tolerance)
     return Reduction(
@@ -120,41 +119,6 @@ def _check_reducible(terms: ReductionTerms) -> None:
         raise ReductionError(
             f"The structure {name} has no mass, hence no modes; give its materials a density."
         )
-
-
-def _design_fields(terms: ReductionTerms) -> DesignFields:
-    """Return the fields of the reduced model that do not depend on the reduced basis."""
-    structure = terms.structure
-    design = structure.design
-    variable_names = (
-        *structure.parameters,
-        *structure.regions,
-        *structure.masses,
-        *structure.controls,
-    )
-    nominal_values = structure.parameters | structure.masses | structure.controls
-    return {
-        "design_hash": structure.design_hash,
-        "name": design.name,
-        "regions": structure.regions,
-        "parameters": tuple(structure.parameters),
-        "masses": tuple(structure.masses),
-        "controls": tuple(structure.controls),
-        "control_units": tuple(structure.control_units.values()),
-        "gauges": structure.gauges,
-        "displacements": structure.displacements,
-        "accelerations": structure.accelerations,
-        "nominal": np.array(
-            [nominal_values.get(name, 0.0) for name in variable_names], dtype=np.float64
-        ),
-        "damping": np.array((design.damping.alpha, design.damping.beta)),
-        "validity_box": np.array(
-            [structure.ranges[name] for name in variable_names], dtype=np.float64
-        ),
-        "stiffness_factors": terms.stiffness_factors,
-        "load_factors": terms.load_factors,
-        "dual_split": terms.splits,
-    }
 
 
 @dataclass(frozen=True)

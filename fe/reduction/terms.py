@@ -23,6 +23,8 @@ same energy could cause."""
 UNSEEN_FRACTION = 0.1
 """If no output responds to a load, its errors are relative to this fraction of the largest output
 of all loads, each at its largest coefficient."""
+STATES_PER_ROUND = 4
+"""Full solutions in a round of the search, and states whose modes are refined together."""
 INNER_MODAL_STATES = 10
 """Number of states inside the box in which the working basis of the modes is refined."""
 INNER_TRAINING_STATES = 128
@@ -33,7 +35,7 @@ MOST_MASS_CORNERS = 64
 """Largest number of corners of the box of masses in which modes are compressed."""
 
 
-class ModalState(NamedTuple):
+class ModalCoefficients(NamedTuple):
     """The coefficients that determine the modes.
 
     Attributes
@@ -284,7 +286,7 @@ class ReductionTerms:
         fractions = (cube_corners(self.varied), halton_points(self.varied, count))
         return self.states(np.concatenate(fractions))
 
-    def refinement_states(self) -> list[ModalState]:
+    def refinement_states(self) -> list[ModalCoefficients]:
         """Return the states in which the working basis of the modes is refined.
 
         These are corners of the box, with least and largest masses in turn, and some states inside.
@@ -296,7 +298,7 @@ class ReductionTerms:
         fractions = np.concatenate((corners, mass_fractions), axis=1)
         return self._modal_states(fractions, INNER_MODAL_STATES)
 
-    def compression_states(self) -> list[ModalState]:
+    def compression_states(self) -> list[ModalCoefficients]:
         """Return the states whose modes the modal basis must represent.
 
         These are corners of the box with each corner of the box of masses, and some states inside.
@@ -309,7 +311,7 @@ class ReductionTerms:
             fractions.append(np.append(state_corner, mass_corner))
         return self._modal_states(np.array(fractions), 4 * INNER_MODAL_STATES)
 
-    def _modal_states(self, fractions: FloatArray, inner_count: int) -> list[ModalState]:
+    def _modal_states(self, fractions: FloatArray, inner_count: int) -> list[ModalCoefficients]:
         """Return states at fractions of all ranges and masses, then `inner_count` states inside."""
         # the first Halton point is the corner of zeros, which is no inner state
         inner_fractions = halton_points(fractions.shape[1], 1 + inner_count)[1:]
@@ -320,7 +322,7 @@ class ReductionTerms:
         modal_states = []
         for state, kilograms in zip(self.states(state_fractions), masses, strict=True):
             mass_coefficients = np.append(1.0, kilograms)  # one for the mass that is always there
-            modal_states.append(ModalState(self.theta(state), mass_coefficients))
+            modal_states.append(ModalCoefficients(self.theta(state), mass_coefficients))
         return modal_states
 
     def least_outputs(self, loads: FloatArray, outputs: FloatArray) -> FloatArray:

@@ -1,8 +1,8 @@
 """A reduced structure whose supports, masses and stiffness can be changed by a patch.
 
 Its coordinates are those of a `ReducedStructure`, followed by extra columns for each possible
-change. A structure is solved in its own basis and the columns of the changes that act. NumPy and
-relative imports only.
+change. `fe.runtime.changed_structure` solves it in its own basis and the columns of the changes
+that act. NumPy and relative imports only.
 """
 
 from collections.abc import Iterable
@@ -15,77 +15,24 @@ from typing import Annotated, NamedTuple
 import numpy as np
 
 from .arrays import FloatArray, IntArray
-from .dense_matrices import dense_sum, lowest_modes
+from .dense_matrices import dense_sum
 from .errors import InvalidPatchError
 from .patch import (
     InterfaceCompliance,
     LoadOffset,
     LoadTilt,
-    ModelPatch,
     PlaceMass,
     Primitive,
     RegionStiffnessLoss,
     SupportCompliance,
 )
 from .reduced import ReducedModel
+from .structural_changes import FITTED_REACH, AddedMass, StructuralChanges, taylor_factors
 
 LEAST_DIRECTION = 1e-11
 """Eigenvalue, relative to the largest, below which a direction of the columns is left out."""
 KEPT_SUBSPACES = 32
 """Number of sets of changes whose matrices are kept."""
-FITTED_REACH = 1.5
-"""Largest distance of a mass from its place along each axis, over the reach of the place. The
-displacements of the nodes within it give the derivatives of the displacement."""
-
-
-class AddedMass(NamedTuple):
-    """A mass at a place, or beside it.
-
-    Attributes
-    ----------
-    number : int
-        Number of the change, from one.
-    kilograms : float
-        The mass [kg].
-    along, across : float
-        Distances from the place [m].
-    """
-
-    number: int
-    kilograms: float
-    along: float
-    across: float
-
-
-def taylor_factors(along: float, across: float) -> FloatArray:
-    """Return the factors (5,) of the derivatives of a displacement beside a place.
-
-    They are those of a Taylor series in the distances s and t: s, t, s^2 / 2, s t, t^2 / 2.
-    """
-    return np.array([along, across, along**2 / 2.0, along * across, across**2 / 2.0])
-
-
-class StructuralChanges(NamedTuple):
-    """The structural changes of a patch, by their numbers in `ChangeableModel`, from one.
-
-    Attributes
-    ----------
-    compliances : dict of int to float
-        Added compliance of motions of supports and interfaces [m/N or rad/(N m)].
-    masses : tuple of AddedMass
-        Added masses.
-    losses : dict of int to float
-        Lost fractions of the stiffness of patches [1].
-    """
-
-    compliances: dict[int, float]
-    masses: tuple[AddedMass, ...]
-    losses: dict[int, float]
-
-    @property
-    def numbers(self) -> tuple[int, ...]:
-        """The numbers of the changes."""
-        return (*self.compliances, *(mass.number for mass in self.masses), *self.losses)
 
 
 class Subspace(NamedTuple):
@@ -239,7 +186,7 @@ class ChangeableModel(ReducedModel):
             "changes": len(self.supports) + len(self.mass_places) + len(self.loss_places),
         }
 
-    def changes_of(self, patch: Iterable[Primitive]) -> "StructuralChanges":
+    def changes_of(self, patch: Iterable[Primitive]) -> StructuralChanges:
         """Collect the structural changes of a patch, by the numbers of the changes.
 
         Changes are numbered from 1: motions of supports, then places of masses, then patches that
@@ -440,63 +387,6 @@ class ChangeableModel(ReducedModel):
         factors = np.append(1.0, vector[: len(self.parameters)])
         return np.asarray(self.support_springs * factors[self.spring_parameters])
 
-    def reactions(
-        self, loads: FloatArray, displacements: FloatArray, springs: FloatArray
-    ) -> FloatArray:
-        """Return the reactions of the supports to loads [N or N m].
-
-        Parameters
-        ----------
-        loads : (n, k) array
-            The loads.
-        displacements : (n, k) array
-            The static displacements under them, with unchanged supports.
-        springs : (S,) array
-            The spring of each support motion [N/m or N m/rad]; 0 where the motion is held rigidly.
-
-        Returns
-        -------
-        (S, k) array
-            The force or moment along each motion.
-        """
-        is_held = springs[:, np.newaxis] == 0.0
-        reaction_of_rigid_support = self.support_rows @ loads
-        reaction_of_spring = springs[:, np.newaxis] * (self.support_rows @ displacements)
-        return np.where(is_held, reaction_of_rigid_support, reaction_of_spring)
-
-    def compliance_gains(self, vector: FloatArray) -> FloatArray:
-        """Return the relative increase of compliance per unit of compliance added at each support.
-
-        Parameters
-        ----------
-        vector : (V,) array
-            Values of the inputs.
-
-        Returns
-        -------
-        (S, L + M) array
-            For each of S support motions the increase [N/m or N m/rad] of the compliance under each
-            load, then that of the inverse squared frequency of each mode, each over its value.
-        """
-        structure = ChangedStructure(self, vector, ModelPatch())
-        loads = self.whole_load.T
-        displacements = structure.basis @ structure.static(structure.basis.T @ loads)
-        work = np.sum(loads * displacements, axis=0)
-        springs = self.springs_at(vector)
-        gains_of_loads = self.reactions(loads, displacements, springs) ** 2 / np.where(
-            work > 0.0, work, np.inf
-        )
-        frequency = structure.modes.frequency
-        shapes = structure.basis @ structure.mode_shapes
-        squared_angular_frequency = (2.0 * np.pi * frequency) ** 2
-        # a mode is the displacement at rest under its inertia forces
-        mass = dense_sum(self.mass_coefficients(vector), self.whole_mass)
-        inertia_forces = squared_angular_frequency * (mass @ shapes)
-        gains_of_modes = (
-            self.reactions(inertia_forces, shapes, springs) ** 2 / squared_angular_frequency
-        )
-        return np.concatenate((gains_of_loads, gains_of_modes), axis=1)
-
 
 class _Subspaces:
     """The subspaces of a model for sets of changes, each computed once."""
@@ -555,112 +445,3 @@ class _Subspaces:
                 if change > len(model.supports) + len(model.mass_places)
             },
         )
-
-
-class ChangedModes(NamedTuple):
-    """The modes of a changed structure.
-
-    Attributes
-    ----------
-    frequency : (M,) array
-        Natural frequencies [Hz].
-    shapes : (k, M) array
-        Mass-normalised shapes.
-    """
-
-    frequency: FloatArray
-    shapes: FloatArray
-
-
-class ChangedStructure:
-    """A reduced structure with fixed inputs under a patch, in k coordinates.
-
-    Parameters
-    ----------
-    vector : (V,) array
-        Values of the inputs.
-
-    Attributes
-    ----------
-    basis : (n, k) array
-        The coordinates of the model from those of this structure: `Subspace.basis`.
-    mass, stiffness : (k, k) array
-        Mass [kg] and stiffness [N/m].
-
-    Raises
-    ------
-    InvalidPatchError
-        If the structure has no such support or location, or a value is not possible.
-    OutsideModelError
-        If an input lies outside its range.
-    """
-
-    rigid_ports: frozenset[str] = frozenset()
-
-    def __init__(self, model: ChangeableModel, vector: FloatArray, patch: ModelPatch) -> None:
-        model.check_validity(vector.tolist())
-        self.mode_count = model.mode_count
-        self._last_output = model.whole_output[-1]
-        changes = model.changes_of(patch)
-        subspace = model.subspace(changes.numbers)
-        self.basis = subspace.basis
-        theta = model.stiffness_coefficients(vector)
-        self.stiffness = dense_sum(theta, subspace.stiffness)
-        self.mass = dense_sum(model.mass_coefficients(vector), subspace.mass)
-        for added in changes.masses:
-            rows = model.rows_of_mass(added) @ self.basis
-            self.mass += added.kilograms * rows.T @ rows
-        for change, loss in changes.losses.items():
-            terms, parts = subspace.lost[change]
-            self.stiffness -= dense_sum(loss * theta[terms], parts)
-        # A released motion q = sqrt(c) y against its spring 1 / c has the energy y^2 / 2: the
-        # limit c = 0 is regular, and holds the support.
-        count = len(self.stiffness)
-        first_released = count - subspace.released
-        self._scale = np.ones(count)
-        released = first_released
-        added_springs = np.zeros(count)
-        springs = model.springs_at(vector)
-        for number, compliance in sorted(changes.compliances.items()):
-            spring = springs[number - 1]
-            if spring == 0.0:
-                self._scale[released] = np.sqrt(compliance)
-                added_springs[released] = 1.0 / compliance if compliance > 0.0 else 0.0
-                released += 1
-            else:
-                added_spring = 1.0 / (1.0 / spring + compliance) - spring
-                row = model.support_rows[number - 1] @ self.basis
-                self.stiffness += added_spring * np.multiply.outer(row, row)
-        self._scaled_stiffness = self._scale[:, np.newaxis] * self.stiffness * self._scale
-        is_released = np.arange(first_released, count)
-        self._scaled_stiffness[is_released, is_released] += 1.0
-        self._scaled_mass = self._scale[:, np.newaxis] * self.mass * self._scale
-        self.stiffness[is_released, is_released] += added_springs[first_released:]
-
-    @cached_property
-    def _inverse_cholesky(self) -> FloatArray:
-        """The inverse L^-1 of the Cholesky factor of the scaled stiffness K = L L^T."""
-        return np.linalg.inv(np.linalg.cholesky(self._scaled_stiffness))
-
-    def static(self, loads: FloatArray) -> FloatArray:
-        """Return the displacements K^-1 f of loads (k,) or (k, m)."""
-        inverse = self._inverse_cholesky
-        scaled_loads = (self._scale * loads.T).T
-        scaled_displacements = inverse.T @ (inverse @ scaled_loads)
-        return np.asarray((self._scale * scaled_displacements.T).T)
-
-    @cached_property
-    def modes(self) -> ChangedModes:
-        """The lowest undamped modes, with the sign that makes the last output positive."""
-        frequency, coordinates = lowest_modes(
-            self._scaled_stiffness, self._scaled_mass, self.mode_count
-        )
-        shapes = self._scale[:, np.newaxis] * coordinates
-        last_output = self._last_output @ self.basis
-        shapes = shapes * np.where(last_output @ shapes < 0.0, -1.0, 1.0)
-        return ChangedModes(frequency, shapes)
-
-    @property
-    def mode_shapes(self) -> FloatArray:
-        """The mass-normalised shapes (k, M) of the modes."""
-        return self.modes.shapes

@@ -12,7 +12,7 @@ from fe.runtime.arrays import FloatArray
 from fe.runtime.errors import CalculixError
 from fe.structure.abaqus import DataLine, KeywordBlock
 from fe.structure.matrix_tables import Dof, read_matrix, read_unknowns
-from fe.verification.calculix_run import read_frequencies, read_tables, run_calculix
+from fe.verification.calculix_run import first_error, read_frequencies, read_tables, run_calculix
 
 from .linear_model import LinearModel, block_lines
 from .loads import DeckLoad
@@ -183,21 +183,6 @@ class CalculixJobs:
                 if _without_blanks(line) in cited and len(line) > len(block.keyword) + 1:
                     return where
         return str(self.model.path)
-
-
-def first_error(log: str) -> str:
-    """Return the first error in CalculiX's messages as one line."""
-    lines = log.splitlines()
-    for number, line in enumerate(lines):
-        if "*ERROR" in line:
-            following = [line]
-            for next_line in lines[number + 1 : number + 5]:
-                if not next_line.strip():
-                    break
-                following.append(next_line)
-            return " ".join(" ".join(following).split())
-    last_lines = [line.strip() for line in lines if line.strip()][-1:]
-    return last_lines[0] if last_lines else "it printed no message."
 
 
 def _without_blanks(text: str) -> str:

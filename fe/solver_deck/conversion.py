@@ -2,6 +2,7 @@
 
 import itertools
 import re
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -43,7 +44,6 @@ from .structure_file import (
     OutputSet,
     choose_output_sets,
     movable_output,
-    row_counts,
     write_structure_files,
 )
 
@@ -380,8 +380,8 @@ def _matched_rows(values: FloatArray, source: StoredMatrices, target: StoredMatr
 
     Names with different numbers of rows belong to held nodes; their values are zero.
     """
-    source_counts = row_counts(source.dofs)
-    target_counts = row_counts(target.dofs)
+    source_counts = Counter(source.dofs)
+    target_counts = Counter(target.dofs)
     values_of_dof: dict[tuple[int, int], list[float]] = {}
     for dof, value in zip(source.dofs, values.tolist(), strict=True):
         values_of_dof.setdefault(dof, []).append(value)

@@ -239,8 +239,6 @@ def read_linear_model(
 
     Parameters
     ----------
-    contact : "tied" or "open"
-        How contact pairs are modelled.
     preload : "tangent" or "none"
         How static steps before a first step of small changes (PERTURBATION) are modelled.
 

@@ -32,7 +32,7 @@ _COUNT_IN_NAME = re.compile(r"(?:C3D|CPS|CPE|CAX|M3D|S)(\d+)[A-Z]*")
 
 
 @dataclass(frozen=True)
-class DeckElement:
+class TypedElement:
     """An element: its type in capital letters, and the numbers of its nodes."""
 
     type_name: str
@@ -52,14 +52,14 @@ class DeckMesh:
     ----------
     points : dict of int to (3,) array
         Position of each node, in the deck's unit of length.
-    elements : dict of int to DeckElement
+    elements : dict of int to TypedElement
         The elements by their numbers.
     node_sets, element_sets : dict of str to list of int
         Members of each set, in the order of the deck, by the set's name in capital letters.
     """
 
     points: dict[int, FloatArray] = field(default_factory=dict)
-    elements: dict[int, DeckElement] = field(default_factory=dict)
+    elements: dict[int, TypedElement] = field(default_factory=dict)
     node_sets: dict[str, list[int]] = field(default_factory=dict)
     element_sets: dict[str, list[int]] = field(default_factory=dict)
 
@@ -131,7 +131,7 @@ def _add_elements(mesh: DeckMesh, block: KeywordBlock) -> None:
     numbers = []
     for record in _element_records(block, node_count):
         number, *nodes = record
-        mesh.elements[number] = DeckElement(type_name, tuple(nodes))
+        mesh.elements[number] = TypedElement(type_name, tuple(nodes))
         numbers.append(number)
     if block.parameters.get("ELSET"):
         mesh.element_sets.setdefault(block.parameters["ELSET"].upper(), []).extend(numbers)

@@ -12,7 +12,7 @@ from fe.structure.deck_text import fail, real
 from fe.structure.mesh import Surface
 from fe.structure.nodal_loads import face_areas
 
-from .mesh_of_deck import DeckElement
+from .mesh_of_deck import TypedElement
 from .shell_sides import KIND_BY_TYPE, ShellGeometry, ShellSide, solid_of_shell
 
 NodalForces = dict[tuple[int, int], float]
@@ -158,7 +158,7 @@ def _pressure_forces(
     return result
 
 
-def _loaded_face(element: DeckElement, label: str) -> _LoadedFace:
+def _loaded_face(element: TypedElement, label: str) -> _LoadedFace:
     """Return the face of an element that the label of a pressure means."""
     solid = solid_of_shell(element.type_name)
     if solid is not None and label in _SHELL_FACES:

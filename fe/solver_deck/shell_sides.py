@@ -12,7 +12,7 @@ from fe.runtime.arrays import FloatArray
 from fe.structure.abaqus import KeywordBlock
 from fe.structure.deck_text import real
 
-from .mesh_of_deck import DeckElement, DeckMesh
+from .mesh_of_deck import DeckMesh, TypedElement
 
 KIND_BY_TYPE = {kind.calculix: kind for kind in DECK_KINDS.values()}
 """Kinds of solids by their names in a deck."""
@@ -102,7 +102,7 @@ class ShellGeometry:
                 sums[node] = sums.get(node, 0.0) + normal
         return {node: total / np.linalg.norm(total) for node, total in sums.items()}
 
-    def _element_normals(self, element: DeckElement, solid: ElementKind) -> FloatArray:
+    def _element_normals(self, element: TypedElement, solid: ElementKind) -> FloatArray:
         """Return the unit normals (k, 3) of a shell at its nodes."""
         face_nodes = list(solid.face_nodes[0])
         _, gradients = solid.shape_functions(solid.node_positions[face_nodes])

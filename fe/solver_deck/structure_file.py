@@ -1,6 +1,7 @@
 """Write a deck as a structure file with matrices and vectors."""
 
 import json
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -73,18 +74,6 @@ class DeckStructure:
     output_sets: list[OutputSet]
     motion_rows: MotionRows
     length_unit: str
-
-    def row_counts(self) -> dict[Dof, int]:
-        """Return the number of rows of each degree of freedom."""
-        return row_counts(self.matrices.dofs)
-
-
-def row_counts(dofs: Sequence[Dof]) -> dict[Dof, int]:
-    """Return the number of rows of each degree of freedom."""
-    counts: dict[Dof, int] = {}
-    for dof in dofs:
-        counts[dof] = counts.get(dof, 0) + 1
-    return counts
 
 
 def choose_output_sets(model: LinearModel, names: Sequence[str]) -> list[OutputSet]:
@@ -195,7 +184,7 @@ def _write_load(structure: DeckStructure, load: DeckLoad, folder: Path) -> str:
         file = f"{load.name}.npy"
         np.save(folder / file, structure.load_vectors[load.name])
         return file
-    counts = structure.row_counts()
+    counts = Counter(structure.matrices.dofs)
     rows = [
         f"{node} {axis} {force!r}"
         for (node, axis), force in sorted(load.forces.items())
@@ -216,7 +205,7 @@ def _output_lines(structure: DeckStructure, output: OutputSet, folder: Path) -> 
     if not name[0].isalpha():
         name = f"n{name}"[:LARGEST_NAME]
     nodes = output.nodes
-    counts = structure.row_counts()
+    counts = Counter(structure.matrices.dofs)
     for letter in output.axes:
         file = _write_mean(structure, output._replace(axes=letter), f"{name}_{letter}", folder)
         yield from ("", "[[displacement]]", f'name = "{name}_{letter}"', f'vector = "{file}"')

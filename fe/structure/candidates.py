@@ -13,8 +13,8 @@ from scipy import sparse
 from scipy.spatial import KDTree
 
 from fe.runtime.arrays import FloatArray, IntArray
-from fe.runtime.changeable import FITTED_REACH, taylor_factors
 from fe.runtime.errors import InvalidDesignError
+from fe.runtime.structural_changes import FITTED_REACH, taylor_factors
 
 from .affine import AffineStructure
 from .design import Gauge, MeshLoad

@@ -31,8 +31,6 @@ class _GaugeStrain(NamedTuple):
 
     Attributes
     ----------
-    gauge : int
-        Index of the gauge.
     weight : float
         Weight of the strain in the mean of the gauge.
     local : (3,) array

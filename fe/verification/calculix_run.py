@@ -85,6 +85,21 @@ def read_frequencies(text: str) -> FloatArray:
     return np.array(frequencies, dtype=np.float64)
 
 
+def first_error(log: str) -> str:
+    """Return the first error in CalculiX's messages as one line."""
+    lines = log.splitlines()
+    for number, line in enumerate(lines):
+        if "*ERROR" in line:
+            following = [line]
+            for next_line in lines[number + 1 : number + 5]:
+                if not next_line.strip():
+                    break
+                following.append(next_line)
+            return " ".join(" ".join(following).split())
+    last_lines = [line.strip() for line in lines if line.strip()][-1:]
+    return last_lines[0] if last_lines else "it printed no message."
+
+
 def run_calculix(text: str, folder: Path, name: str, time_limit: float = _TIME_LIMIT) -> str:
     """Run CalculiX on an input and return the content of its `.dat` file.
 
@@ -123,9 +138,8 @@ def run_calculix(text: str, folder: Path, name: str, time_limit: float = _TIME_L
     result = folder / f"{name}.dat"
     has_finished = process.returncode == 0 and "Job finished" in process.stdout
     if not has_finished or not result.is_file():
-        errors = [line.strip() for line in process.stdout.splitlines() if "*ERROR" in line]
-        first_error = f" ({errors[0]})" if errors else ""
         raise CalculixError(
-            f"CalculiX did not finish {folder / name}.inp{first_error}; its messages are in {log}."
+            f"CalculiX did not finish {folder / name}.inp ({first_error(process.stdout)}); its "
+            f"messages are in {log}."
         )
     return result.read_text(encoding="ascii", errors="replace")

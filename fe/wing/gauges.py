@@ -62,8 +62,6 @@ class _SkinPoint(NamedTuple):
 
     Attributes
     ----------
-    gauge : int
-        Index of the gauge.
     weight : float
         Weight of the strain in the mean of the gauge.
     local : (3,) array

@@ -36,15 +36,10 @@ _BLOCK_BYTES = 2**20
 
 
 class Host(Protocol):
-    """What runs the FMU of an asset: one replaceable instance, or several coupled ones.
-
-    Attributes
-    ----------
-    reset_trial : ResetTrial
-        What is known about restarts of the FMU.
-    """
+    """What runs the FMU of an asset: one replaceable instance, or several coupled ones."""
 
     reset_trial: ResetTrial
+    """What is known about restarts of the FMU."""
 
     @property
     def request(self) -> "memoryview[float]":
@@ -139,8 +134,6 @@ class InstanceHost:
         The request of this instance: time, step size, inputs.
     reply : (n_outputs,) ndarray
         Its reply.
-    reset_trial : ResetTrial
-        What is known about restarts of the FMU.
     """
 
     request: "memoryview[float]"

@@ -57,8 +57,6 @@ def cross_compile_library(sources: Mapping[str, bytes], targets: Sequence[Target
 
     Parameters
     ----------
-    sources : mapping of str to bytes
-        The content of sources and headers by file name, all in one folder.
     targets : sequence of str
         Processor and system, such as ["x86_64-windows"]. Several processors are possible on macOS,
         whose file then contains the library of each.

@@ -282,8 +282,6 @@ def compiled_binaries(
     ----------
     members : mapping of str to bytes
         The files of the FMU.
-    fmi : {2, 3}
-        The version of FMI.
     platforms : sequence of str, optional
         The platforms of the binaries, see `targets_by_folder`; zig compiles for them. By default,
         the C compiler of this host compiles for this host.

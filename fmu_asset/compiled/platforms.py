@@ -47,8 +47,6 @@ def targets_by_folder(
     platforms : sequence of str
         Names of platforms, see `Platform`. In either version of FMI, a name of FMI 2 stands for the
         targets that it covers. "all" stands for all targets for which the version has a folder.
-    fmi : {2, 3}
-        The version of FMI.
 
     Raises
     ------

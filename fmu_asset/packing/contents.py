@@ -99,8 +99,6 @@ def checked_target(
 
     Parameters
     ----------
-    replace : bool
-        Whether an existing file may be replaced.
     file_kind : str
         The kind of the file, with its article, for the message: "An FMU".
     suffix : str

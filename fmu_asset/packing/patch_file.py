@@ -108,8 +108,6 @@ class PatchFile:
 
         Parameters
         ----------
-        gauge_count : int
-            Number of gauges of the wing.
         patch_label : str
             The name of the patch in messages.
 

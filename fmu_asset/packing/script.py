@@ -59,8 +59,6 @@ def build_script_fmu(
         and the packages that are installed on the machine that runs the FMU.
     path : path-like
         The file to write, with the suffix .fmu.
-    replace : bool
-        Whether an existing file may be replaced.
 
     Raises
     ------

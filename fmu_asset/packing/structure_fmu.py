@@ -123,8 +123,6 @@ def build_fmu(
         of FMI 2; "x86_64-linux", "x86_64-windows", "x86_64-darwin", "aarch64-darwin" and
         "aarch64-linux", which are names of FMI 3; or "all". The extra `cross` must be installed. By
         default, the C compiler of this host compiles for this host.
-    replace : bool
-        Whether an existing file may be replaced.
 
     Returns
     -------

@@ -53,7 +53,9 @@ class LogMessage(NamedTuple):
 class Slave:
     """An FMI co-simulation slave; packing combines a subclass with pythonfmu's `Fmi2Slave`.
 
-    Class attributes ---------------- content_tag : str
+    Attributes
+    ----------
+    content_tag : str
         The content hash of the FMU; a state that another FMU has saved is refused.
     load_contents : static method
         Takes the folder of resources and returns `SlaveContents`.

@@ -258,8 +258,6 @@ class SwitchableEffects:
 
     Parameters
     ----------
-    gauge_count : int
-        Number of gauges of the wing.
     arrays : PatchArrays, optional
         The wing for patches; None if all effects are those of sensors.
 

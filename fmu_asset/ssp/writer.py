@@ -58,8 +58,6 @@ def write_ssp(
         End of the default experiment [s].
     step_size : float, optional
         Communication step size [s], in the annotation of the Open Simulation Platform.
-    replace : bool
-        Whether an existing file may be replaced.
 
     Raises
     ------

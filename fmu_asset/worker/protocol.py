@@ -17,6 +17,8 @@ import struct
 import time
 from enum import IntEnum
 
+from reporting.system.operating_system import usable_processors
+
 HEADER = struct.Struct("<HHIQ")
 WORKER_NUMBER = struct.Struct("<q")
 """Process number of the worker, which is sent first of all."""
@@ -58,14 +60,7 @@ processor for each of twin and worker, both therefore poll for a moment first.
 """
 
 
-def _processor_count() -> int:
-    """Return the number of processors that this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
-
-
-_PROCESSOR_COUNT = _processor_count()
+_PROCESSOR_COUNT = usable_processors()
 
 
 def joined(*texts: str) -> bytes:

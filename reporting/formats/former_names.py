@@ -39,8 +39,6 @@ def with_present_names(
         location does not number the tables of a list, and `*` stands for every key.
     source : str
         The name of the file, or what else was read; begins the message.
-    error : type of Exception
-        The exception to raise.
 
     Returns
     -------

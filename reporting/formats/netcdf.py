@@ -81,10 +81,6 @@ def write_groups(
 
     Parameters
     ----------
-    path : Path
-        The path of the file.
-    groups : mapping of str to NetcdfGroup
-        The groups by name.
     attrs : mapping of str to object
         The attributes of the root.
     """

@@ -65,8 +65,6 @@ class TextTable:
         The cells of each column, without blanks around them.
     lines : tuple of int
         The number of the line in the file, for each row.
-    errors : TableErrors
-        The exceptions to raise.
     """
 
     name: str
@@ -82,8 +80,6 @@ class TextTable:
 
         Parameters
         ----------
-        column : str
-            The name of the column.
         needed_by : str
             What needs the column, for the message.
 
@@ -106,8 +102,6 @@ class TextTable:
 
         Parameters
         ----------
-        column : str
-            The name of the column.
         needed_by : str
             What needs the column, for the message.
         empty_allowed : bool
@@ -198,8 +192,6 @@ def read_table(path: Path | str, errors: TableErrors, *, name: str | None = None
     ----------
     path : Path or str
         The file; UTF-8, with or without a byte order mark.
-    errors : TableErrors
-        The exceptions to raise.
     name : str, optional
         The name of the table in messages; the path by default.
 

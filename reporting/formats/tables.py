@@ -51,8 +51,6 @@ class KeyTable:
 
     Attributes
     ----------
-    schema : dict
-        The JSON Schema of the table.
     locations : list of str
         Where the table can stand in a file; empty for the file as a whole.
     """
@@ -73,8 +71,6 @@ class PrintedTable:
 
     Attributes
     ----------
-    schema : dict
-        The JSON Schema of the table.
     address : str
         The page, relative to the pages of the formats, and the anchor of the table on it.
     """
@@ -135,8 +131,6 @@ def markdown_of_format(
     ----------
     schema : dict
         The JSON Schema of the format.
-    notation : {"toml", "json"}
-        The language of its files.
     printed : sequence of PrintedTable
         Tables of other pages. A table of the format that equals one of them is not printed again;
         keys link to the other page.

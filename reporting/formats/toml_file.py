@@ -48,8 +48,6 @@ def read_toml(path: Path | str, error: type[Exception], *, what: str = "file") -
     ----------
     path : Path or str
         The file; UTF-8, with or without a byte order mark.
-    error : type of Exception
-        The exception to raise.
     what : str
         What the file should be, for the message: "wing design".
 
@@ -67,8 +65,6 @@ def parse_toml(content: bytes | str, source: str, error: type[Exception]) -> Tom
 
     Parameters
     ----------
-    content : bytes or str
-        The text of the file.
     source : str
         Where the text is from; begins the message.
     error : type of Exception
@@ -301,8 +297,6 @@ def validate(
         The content of the file.
     source : str
         The name of the file; begins the message.
-    error : type of Exception
-        The exception to raise.
     what : str
         What the file describes, with its article, for the message: "a lumped model".
     first_index : int

@@ -248,8 +248,6 @@ def plain_powers(axis: Axis, multiples: tuple[float, ...]) -> None:
 
     Parameters
     ----------
-    axis : Axis
-        The horizontal or vertical axis of a panel.
     multiples : tuple of float
         The multiples of powers of ten that are labelled, such as (1, 2, 5).
     """
@@ -278,8 +276,6 @@ def interval(
 
     Parameters
     ----------
-    axes : Axes
-        The panel to draw in.
     x : float
         The horizontal coordinate.
     mean, low, high : float
@@ -320,8 +316,6 @@ def shared_legend(
 
     Parameters
     ----------
-    figure : Figure
-        The figure with all its panels drawn.
     rows : int
         The number of rows of the legend.
     bbox_to_anchor : (float, float)
@@ -354,8 +348,6 @@ def color_bar(
 
     Parameters
     ----------
-    figure : Figure
-        The figure with all its panels drawn.
     artist : ScalarMappable or ColorizingArtist
         The map or the points whose colours stand for values.
     label : str
@@ -380,8 +372,6 @@ def panel_label(axes: Axes, label: str, title: str = "") -> None:
 
     Parameters
     ----------
-    axes : Axes
-        The panel to draw in.
     label : str
         Its letter, such as ``a``.
     title : str
@@ -421,8 +411,6 @@ def to_png(figure: Figure, resolution: float = PNG_RESOLUTION) -> bytes:
 
     Parameters
     ----------
-    figure : Figure
-        The figure with all its panels drawn.
     resolution : float
         The resolution in dots per inch.
     """

@@ -330,8 +330,6 @@ def _axis_record(axis: Axis, limits: tuple[float, float], scale: str, name: str)
 
     Parameters
     ----------
-    axis : Axis
-        The horizontal or vertical axis of a panel.
     limits : (float, float)
         The values at its ends.
     scale : str

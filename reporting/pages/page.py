@@ -30,8 +30,6 @@ class ReportFigure(NamedTuple):
     ----------
     name : str
         The name of its file, without ending.
-    figure : Figure
-        The figure with all its panels drawn.
     title, caption : str
         The text below it.
     """

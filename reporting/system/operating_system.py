@@ -48,8 +48,6 @@ def open_descriptor(path: Path, flags: int, mode: int = 0o666) -> int:
 
     Parameters
     ----------
-    path : Path
-        The file.
     flags : int
         The flags of `os.open`.
     mode : int

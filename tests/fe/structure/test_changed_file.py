@@ -13,7 +13,7 @@ from fe.reduction.change_basis import with_changes
 from fe.reduction.model_cache import reduced_model
 from fe.reduction.reduced_basis import reduce_structure
 from fe.runtime.arrays import FloatArray
-from fe.runtime.changeable import ChangedStructure
+from fe.runtime.changed_structure import ChangedStructure
 from fe.runtime.errors import InvalidDesignError, InvalidPatchError
 from fe.runtime.patch import (
     GaugeOffset,
