@@ -15,7 +15,12 @@ from pathlib import Path
 import numpy as np
 from scipy.linalg import expm
 
-from discrepancy.estimation.kernel import filter_record, smooth_record, substep_matrices_with_laws
+from discrepancy.estimation.kernel import (
+    filter_record,
+    smooth_record,
+    smoothed_variances,
+    substep_matrices_with_laws,
+)
 from discrepancy.trials_in_motion.steps import respond_to_inputs
 from fe.reduction.reduced_basis import reduce_structure
 from fe.structure.operators import load_and_assemble
@@ -97,18 +102,16 @@ def estimator(inputs: Inputs) -> bytes:
     innovations, gains, variances, means, covariances = filter_record(
         substeps, kinds, transition, noise, rows, readings, is_used, np.eye(2), start, True
     )
-    motion, variance = smooth_record(
-        substeps,
-        kinds,
-        transition,
-        rows,
-        is_used,
+    steps = (substeps, kinds, transition, rows, is_used)
+    motion = smooth_record(
+        *steps,
         np.ascontiguousarray(innovations[:, :, 0]),
         gains,
         variances,
         np.ascontiguousarray(means[:, :, 0]),
         covariances,
     )
+    variance = smoothed_variances(*steps, gains, variances, covariances)
     return motion.tobytes() + variance.tobytes()
 
 

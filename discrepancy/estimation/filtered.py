@@ -12,7 +12,12 @@ from discrepancy.trials_in_motion.trajectory import Trajectory
 from discrepancy.trials_in_motion.trial_at_rest import LinearTrial
 
 from .force_states import ForceStates
-from .kernel import filter_record, smooth_record, substep_matrices_with_laws
+from .kernel import (
+    filter_record,
+    smooth_record,
+    smoothed_variances,
+    substep_matrices_with_laws,
+)
 from .linearised import LinearisedTrial
 from .process_search import Processes
 
@@ -185,7 +190,7 @@ class FilteredTrial:
         linear_trial = self.linear_trial
         trial = linear_trial.trial
         weights = np.concatenate(([1.0], unknowns))
-        states, variance = self.smooth_residual(linear_trial.columns @ weights)
+        states = self.smooth_residual(linear_trial.columns @ weights)
         structure_states = states[:, self._structure] * self.force_states.state_units
         added_state = linear_trial.known_states @ weights + structure_states
         # forces of the laws, at each fine stamp by the whole state there
@@ -207,46 +212,24 @@ class FilteredTrial:
             trial=trial,
             trajectory=Trajectory(added_state, positions, speeds, forces),
             missing_forces=missing_forces,
-            missing_force_deviations=self.missing_forces(np.sqrt(variance)),
             effect_forces=linear_trial.effect_forces,
             local=local_values,
         )
 
-    def smooth_residual(self, residual: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the smoothed scaled state, given a residual, and its variance.
+    def smooth_residual(self, residual: FloatArray) -> FloatArray:
+        """Return the smoothed scaled state (F, n), which contains the missing forces.
 
-        Parameters
-        ----------
-        residual : (N, C) array
-            The readings minus their known part, divided by the noise.
-
-        Returns
-        -------
-        states, variance : (F, n) array
-            The state, which contains the missing forces, and the variance of each of its entries.
+        `residual` (N, C) is the readings minus their known part, divided by the noise.
         """
         linear_trial = self.linear_trial
-        trial = linear_trial.trial
-        transitions, noises = self._substeps
-        scaled_residual = residual * self.force_states.white_noise_scale
-        innovations, gains, variances, means, covariances = filter_record(
-            trial.substeps,
-            linear_trial.step_kinds,
-            transitions,
-            noises,
-            self.output_rows,
-            np.ascontiguousarray(scaled_residual[:, :, None]),
-            trial.used,
-            self._initial_covariance,
-            np.zeros((len(self._initial_covariance), 1)),
-            True,
-        )
+        transitions, _ = self._substeps
+        innovations, gains, variances, means, covariances = self._filter_states(residual)
         return smooth_record(
-            trial.substeps,
+            linear_trial.trial.substeps,
             linear_trial.step_kinds,
             transitions,
             self.output_rows,
-            trial.used,
+            linear_trial.trial.used,
             np.ascontiguousarray(innovations[:, :, 0]),
             gains,
             variances,
@@ -254,10 +237,54 @@ class FilteredTrial:
             covariances,
         )
 
+    def smoothed_state_variances(self) -> FloatArray:
+        """Return the variance (F, n) of each entry of the smoothed scaled state.
+
+        It is the same for all readings.
+        """
+        linear_trial = self.linear_trial
+        transitions, _ = self._substeps
+        is_used = linear_trial.trial.used
+        _, gains, variances, _, covariances = self._filter_states(np.zeros(is_used.shape))
+        return smoothed_variances(
+            linear_trial.trial.substeps,
+            linear_trial.step_kinds,
+            transitions,
+            self.output_rows,
+            is_used,
+            gains,
+            variances,
+            covariances,
+        )
+
+    def _filter_states(
+        self, residual: FloatArray
+    ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
+        """Return what `filter_record` returns of a residual (N, C), with the filtered states."""
+        linear_trial = self.linear_trial
+        transitions, noises = self._substeps
+        scaled_residual = residual * self.force_states.white_noise_scale
+        return filter_record(
+            linear_trial.trial.substeps,
+            linear_trial.step_kinds,
+            transitions,
+            noises,
+            self.output_rows,
+            np.ascontiguousarray(scaled_residual[:, :, None]),
+            linear_trial.trial.used,
+            self._initial_covariance,
+            np.zeros((len(self._initial_covariance), 1)),
+            True,
+        )
+
+    @property
+    def missing_force_deviations(self) -> dict[int, FloatArray]:
+        """The posterior standard deviation (F,) of the missing force at each port, by its index."""
+        return self.missing_forces(np.sqrt(self.smoothed_state_variances()))
+
     def forces_of_residual(self, residual: FloatArray) -> dict[int, FloatArray]:
         """Return the missing force (F,) by port that is estimated from a residual (N, C)."""
-        states, _ = self.smooth_residual(residual)
-        return self.missing_forces(states)
+        return self.missing_forces(self.smooth_residual(residual))
 
     def missing_forces(self, states: FloatArray) -> dict[int, FloatArray]:
         """Return the missing force (F,) at each port, given scaled states (F, n).
@@ -286,8 +313,6 @@ class SmoothedTrial:
     missing_forces : mapping of int to (F,) ndarray
         The missing force at each port, which no law explains, by the index of the port [N, N m or
         the port's flow].
-    missing_force_deviations : mapping of int to (F,) ndarray
-        The posterior standard deviation of `missing_forces`.
     effect_forces : mapping of int to (F,) ndarray
         The forces of the hypothesis' effects, by port, along the trajectory about which they are
         linear. They are not those along the smoothed motion, which differs little: where dry
@@ -299,7 +324,6 @@ class SmoothedTrial:
     trial: LinearTrial
     trajectory: Trajectory
     missing_forces: Mapping[int, FloatArray]
-    missing_force_deviations: Mapping[int, FloatArray]
     effect_forces: Mapping[int, FloatArray]
     local: FloatArray
 

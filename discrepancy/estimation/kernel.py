@@ -38,14 +38,14 @@ def propagate_covariance(
     `work` (n, n) is overwritten as working memory.
     """
     size = len(transition)
-    multiply(transition, covariance, work)
+    multiply(transition, covariance, propagated)
     for i in range(size):
-        for k in range(i + 1):
-            element = 0.0
-            for j in range(size):
-                element += work[i, j] * transition[k, j]
-            propagated[i, k] = element
-            propagated[k, i] = element
+        for k in range(size):
+            work[k, i] = propagated[i, k]
+    multiply(transition, work, propagated)
+    for i in range(size):
+        for k in range(i):
+            propagated[i, k] = propagated[k, i]
 
 
 @compiled
@@ -219,18 +219,6 @@ def update_covariance(covariance: FloatArray, output_row: FloatArray, gain: Floa
 
 
 @callable_when_compiled
-def predict_mean(transition: FloatArray, mean: FloatArray, predicted_mean: FloatArray) -> None:
-    """Fill the means (n, W) after a step. Zeros of the transition are skipped."""
-    predicted_mean[:] = 0.0
-    for i in range(len(transition)):
-        for j in range(len(transition)):
-            coefficient = transition[i, j]
-            if coefficient != 0.0:
-                for w in range(mean.shape[1]):
-                    predicted_mean[i, w] += coefficient * mean[j, w]
-
-
-@callable_when_compiled
 def update_mean(
     output_row: FloatArray, gain: FloatArray, innovation: FloatArray, mean: FloatArray
 ) -> None:
@@ -324,7 +312,7 @@ def filter_record(
         # predict over the step
         kind = step_kinds[j]
         if kind >= 0:
-            predict_mean(transitions[kind], mean, predicted_mean)
+            multiply(transitions[kind], mean, predicted_mean)
             mean, predicted_mean = predicted_mean, mean
             if not steady:
                 propagate_covariance(transitions[kind], covariance, work, predicted_covariance)
@@ -368,11 +356,11 @@ def smooth_record(
     variances: FloatArray,
     states: FloatArray,
     covariances: FloatArray,
-) -> tuple[FloatArray, FloatArray]:
-    """Return the smoothed state at each fine stamp, and its variances.
+) -> FloatArray:
+    """Return the state (F, n) at each fine stamp, given all readings.
 
     This is the fixed-interval smoother of de Jong (1989, J. American Statistical Association 84,
-    1085-1088), which inverts no covariance. In his letters `adjoint` is r, and `information` is N.
+    1085-1088), which inverts no covariance. In his letters `adjoint` is r.
 
     Parameters
     ----------
@@ -384,33 +372,75 @@ def smooth_record(
         The arrays that `filter_record` returns.
     states : (F, n) ndarray
         The filtered states at the values of all weights.
-
-    Returns
-    -------
-    smoothed_states, variance : (F, n), (F, n) ndarray
-        The state given all readings, and the variance of each of its entries.
     """
     stamp_count, state_count = states.shape
     channel_count = is_used.shape[1]
     has_one_row = len(output_rows) == 1
     smoothed_states = np.empty((stamp_count, state_count))
-    variance = np.empty((stamp_count, state_count))
     adjoint = np.zeros(state_count)
+    carried = np.empty(state_count)
+    for j in range(stamp_count - 1, -1, -1):
+        # smoothed state: filtered state + C r, by the later readings
+        for i in range(state_count):
+            smoothed_states[j, i] = states[j, i]
+            for m in range(state_count):
+                smoothed_states[j, i] += covariances[j, i, m] * adjoint[m]
+        # update by the readings of a sample, in reverse order
+        if j % substeps == 0:
+            k = j // substeps
+            rows = output_rows[0] if has_one_row else output_rows[k]
+            for c in range(channel_count - 1, -1, -1):
+                if not is_used[k, c]:
+                    continue
+                correction = innovations[k, c] / variances[k, c]
+                for i in range(state_count):
+                    correction -= gains[k, c, i] * adjoint[i]
+                for i in range(state_count):
+                    adjoint[i] += rows[c, i] * correction
+        # carry back over the substep
+        if j > 0:
+            transition = transitions[step_kinds[j]]
+            carried[:] = 0.0
+            for i in range(state_count):
+                for m in range(state_count):
+                    carried[m] += transition[i, m] * adjoint[i]
+            adjoint[:] = carried
+    return smoothed_states
+
+
+@compiled
+def smoothed_variances(
+    substeps: int,
+    step_kinds: IntArray,
+    transitions: FloatArray,
+    output_rows: FloatArray,
+    is_used: BoolArray,
+    gains: FloatArray,
+    variances: FloatArray,
+    covariances: FloatArray,
+) -> FloatArray:
+    """Return the variance (F, n) of each entry of the state at each fine stamp, given all readings.
+
+    It does not depend on the readings themselves. The smoother is that of `smooth_record`; in its
+    author's letters `information` is N. The arguments are those of `smooth_record`.
+    """
+    stamp_count, state_count = covariances.shape[:2]
+    channel_count = is_used.shape[1]
+    has_one_row = len(output_rows) == 1
+    smoothed = np.empty((stamp_count, state_count))
     information = np.zeros((state_count, state_count))
     work = np.empty((state_count, state_count))
     carried = np.empty((state_count, state_count))
     information_gain = np.empty(state_count)
     for j in range(stamp_count - 1, -1, -1):
-        # smoothed state: filtered state + C r, by the later readings; its covariance is C - C N C
+        # the smoothed covariance is C - C N C
         multiply(covariances[j], information, work)
         for i in range(state_count):
             reduction = 0.0
-            smoothed_states[j, i] = states[j, i]
             for m in range(state_count):
-                smoothed_states[j, i] += covariances[j, i, m] * adjoint[m]
                 reduction += work[i, m] * covariances[j, m, i]
-            variance[j, i] = max(covariances[j, i, i] - reduction, 0.0)
-        # update both by the readings of a sample, in reverse order
+            smoothed[j, i] = max(covariances[j, i, i] - reduction, 0.0)
+        # update by the readings of a sample, in reverse order
         if j % substeps == 0:
             k = j // substeps
             rows = output_rows[0] if has_one_row else output_rows[k]
@@ -418,26 +448,22 @@ def smooth_record(
                 if not is_used[k, c]:
                     continue
                 row, gain = rows[c], gains[k, c]
-                row_information, later_correction = 1.0 / variances[k, c], 0.0
+                row_information = 1.0 / variances[k, c]
                 for i in range(state_count):
                     information_gain[i] = 0.0
                     for m in range(state_count):
                         information_gain[i] += information[i, m] * gain[m]
                     row_information += gain[i] * information_gain[i]
-                    later_correction += gain[i] * adjoint[i]
-                correction = innovations[k, c] / variances[k, c] - later_correction
                 for i in range(state_count):
-                    adjoint[i] += row[i] * correction
                     for m in range(state_count):
                         information[i, m] += (
                             row_information * row[i] * row[m]
                             - row[i] * information_gain[m]
                             - information_gain[i] * row[m]
                         )
-        # carry both back over the substep
+        # carry back over the substep
         if j > 0:
             backward = np.ascontiguousarray(transitions[step_kinds[j]].T)
-            adjoint = backward @ adjoint
             propagate_covariance(backward, information, work, carried)
             information[:] = carried
-    return smoothed_states, variance
+    return smoothed

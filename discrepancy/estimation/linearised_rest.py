@@ -186,6 +186,13 @@ class RestUnderForces:
         forces = np.einsum("ncm,nc->nm", self._whitened_by_force, whitened) * self._deviations
         return dict(zip(self.processes, forces.T, strict=True))
 
+    @property
+    def missing_force_deviations(self) -> dict[int, FloatArray]:
+        """The posterior standard deviation (N,) of the missing force at each port, by its index."""
+        explained_shares = np.sum(self._whitened_by_force**2, axis=1)
+        deviations = self._deviations * np.sqrt(np.maximum(1.0 - explained_shares, 0.0))
+        return dict(zip(self.processes, deviations.T, strict=True))
+
     def smooth(self, unknowns: FloatArray) -> SmoothedTrial:
         """Return the positions and forces of the trial at values of the unknowns."""
         linear_trial = self.linear_trial
@@ -193,8 +200,6 @@ class RestUnderForces:
         weights = np.concatenate(([1.0], unknowns))
         missing_forces = self.forces_of_residual(linear_trial.columns @ weights)
         missing = np.column_stack([*missing_forces.values()])
-        explained_shares = np.sum(self._whitened_by_force**2, axis=1)
-        deviations = self._deviations * np.sqrt(np.maximum(1.0 - explained_shares, 0.0))
         own_forces = linear_trial.force_by_own_force[:, :, list(self.processes)]
         forces = linear_trial.force_by_weight @ weights
         forces = forces + np.einsum("npm,nm->np", own_forces, missing)
@@ -207,7 +212,6 @@ class RestUnderForces:
                 positions, {port: forces[:, port] for port in acting_ports}
             ),
             missing_forces=missing_forces,
-            missing_force_deviations=dict(zip(self.processes, deviations.T, strict=True)),
             effect_forces=linear_trial.effect_forces,
             local=unknowns[len(linear_trial.shared) + len(linear_trial.effect) :],
         )

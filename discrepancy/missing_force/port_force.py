@@ -296,9 +296,11 @@ def _forces_by_trial(
     port, and `recorded` has the trials as they were recorded, by name.
     """
     trial_forces = []
+    filtered_trials = estimate.linearisation.filter(estimate.processes)
+    trials = list(zip(filtered_trials, estimate.trials, strict=True))
     # the few load steps at rest tell little beside records in motion
-    in_motion = [trial for trial in estimate.trials if not trial.trial.is_at_rest]
-    for smoothed_trial in in_motion or estimate.trials:
+    in_motion = [pair for pair in trials if not pair[1].trial.is_at_rest]
+    for filtered_trial, smoothed_trial in in_motion or trials:
         trial = smoothed_trial.trial
         samples = slice(None, None, trial.substeps)
         law_force = smoothed_trial.effect_forces[port][samples] if has_law else None
@@ -311,7 +313,7 @@ def _forces_by_trial(
                 variables=_inputs_and_rates(recorded[trial.name], trial.stride),
                 # the law's force counts as exact: the deviation is that of the missing force alone
                 force=smoothed_trial.lacking_forces[port][samples],
-                deviation=smoothed_trial.missing_force_deviations[port][samples],
+                deviation=filtered_trial.missing_force_deviations[port][samples],
                 law=law_force,
             )
         )

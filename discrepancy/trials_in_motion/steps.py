@@ -169,14 +169,17 @@ def state_under_inputs(
 def multiply(left_matrix: FloatArray, right_matrix: FloatArray, product: FloatArray) -> None:
     """Fill `product` with the product of two small matrices.
 
-    For these, a loop is several times faster than a call of BLAS.
+    For these, a loop is several times faster than a call of BLAS. The innermost loop runs along
+    rows, so that the compiler computes several entries at once. Zeros on the left are skipped:
+    transitions of modes have many.
     """
+    product[:] = 0.0
     for i in range(left_matrix.shape[0]):
-        for k in range(right_matrix.shape[1]):
-            element = 0.0
-            for j in range(left_matrix.shape[1]):
-                element += left_matrix[i, j] * right_matrix[j, k]
-            product[i, k] = element
+        for j in range(left_matrix.shape[1]):
+            coefficient = left_matrix[i, j]
+            if coefficient != 0.0:
+                for k in range(right_matrix.shape[1]):
+                    product[i, k] += coefficient * right_matrix[j, k]
 
 
 @callable_when_compiled

@@ -8,6 +8,7 @@ from discrepancy.estimation.kernel import (
     filter_record,
     respond_to_drift,
     smooth_record,
+    smoothed_variances,
     substep_matrices_with_laws,
 )
 from discrepancy.trials_in_motion.steps import respond_to_inputs
@@ -85,10 +86,9 @@ def test_the_smoother_gives_mean_and_variance_of_all_states(record):
     transition, _, _, rows, _, used, *_ = record
     weights = np.array([1.0, -0.4, 0.7])
     known, (innovations, gains, variances, means, covariances) = filtered(record, keeps_states=True)
-    smoothed, variance = smooth_record(
-        PARTS, KINDS, transition, rows, used, innovations @ weights, gains, variances,
-        means @ weights, covariances,
-    )  # fmt: skip
+    steps = (PARTS, KINDS, transition, rows, used)
+    smoothed = smooth_record(*steps, innovations @ weights, gains, variances, means @ weights, covariances)
+    variance = smoothed_variances(*steps, gains, variances, covariances)
     forcing, whole, matrix, left = joint(record)
     gain = whole @ matrix.T @ np.linalg.inv(matrix @ whole @ matrix.T + np.eye(len(matrix)))
     expected = forcing @ weights + gain @ (left - matrix @ forcing) @ weights

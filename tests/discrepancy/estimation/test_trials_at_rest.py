@@ -104,15 +104,14 @@ def test_readings_have_the_covariance_of_noise_and_independent_forces(search, tr
 def test_a_smoothed_force_is_the_mean_of_its_posterior(search, trials, start):
     trial = along_laws(search, trials, start)
     deviation = 0.7
-    smoothed = RestUnderForces(trial, {0: Process(deviation, 1.0)}).smooth(
-        unknowns_of(trials, start, trial)[1:]
-    )
+    under_forces = RestUnderForces(trial, {0: Process(deviation, 1.0)})
+    smoothed = under_forces.smooth(unknowns_of(trials, start, trial)[1:])
     residual = trial.columns @ unknowns_of(trials, start, trial)
     own_force = 1.0 / (1.0 + trial.forces[0].law_force.by_position * trial.trial.response.compliance[:, 0, 0])
     by_force = trial.trial.response.outputs_by_force[:, 0] * own_force[:, None]
     precision = 1.0 / deviation**2 + np.sum(by_force**2, axis=1)
     np.testing.assert_allclose(smoothed.missing_forces[0], np.sum(by_force * residual, axis=1) / precision)
-    np.testing.assert_allclose(smoothed.missing_force_deviations[0], precision**-0.5)
+    np.testing.assert_allclose(under_forces.missing_force_deviations[0], precision**-0.5)
 
 
 def test_a_unit_force_moves_a_spring_by_its_compliance(search):

@@ -152,8 +152,8 @@ def test_evidence_and_force_are_those_of_dense_conditioning(rough, uneven, unkno
     )
     if unknown:
         return
-    states, variances = filtered(trial, process).smooth_residual(trial.residual)
-    force, deviation = (filtered(trial, process).missing_forces(of)[0] for of in (states, np.sqrt(variances)))
+    force = filtered(trial, process).forces_of_residual(trial.residual)[0]
+    deviation = filtered(trial, process).missing_force_deviations[0]
     mean = cross[:, at] @ np.linalg.solve(covariance, readings)
     np.testing.assert_allclose(force, mean, atol=0.02 * process.standard_deviation)
     own = cross[::PARTS, at]
@@ -182,12 +182,12 @@ def test_steady_gains_are_those_of_every_step():
         jittered, "intervals", SampleIntervals(np.full(900, 0.02), np.arange(900))
     )  # as if each were its own
     assert evidence(trial, PROCESS) == pytest.approx(evidence(jittered, PROCESS), abs=1e-6)
-    for one, other in zip(
-        filtered(trial, PROCESS).smooth_residual(trial.residual),
-        filtered(jittered, PROCESS).smooth_residual(trial.residual),
-        strict=True,
-    ):
-        np.testing.assert_allclose(one, other, atol=1e-7)
+    states, other_states = (filtered(of, PROCESS).smooth_residual(trial.residual) for of in (trial, jittered))
+    np.testing.assert_allclose(states, other_states, atol=1e-7)
+    variances, other_variances = (
+        filtered(of, PROCESS).smoothed_state_variances() for of in (trial, jittered)
+    )
+    np.testing.assert_allclose(variances, other_variances, atol=1e-7)
 
 
 def test_a_steady_covariance_is_not_computed_anew():
@@ -231,7 +231,7 @@ def test_a_force_of_a_long_correlation_stays_finite():
     """Backwards it would grow by e^1000 within a step."""
     trial = trial_of(1.0 * np.arange(20), np.ones((20, 2)))
     short = Process(1.0, 1e-3)
-    states, _ = filtered(trial, short).smooth_residual(trial.residual)
+    states = filtered(trial, short).smooth_residual(trial.residual)
     assert np.isfinite(evidence(trial, short))
     assert np.all(np.isfinite(states))
 
