@@ -170,10 +170,11 @@ def look_alike_remark(verdict: Verdict, compared: Iterable[Effect]) -> str | Non
     )
     if not compared_similar:
         return remark
+    names = [compared_by_identifier[identifier].name for identifier in compared_similar]
     was_or_were = "was" if len(compared_similar) == 1 else "were"
     return (
-        f"{remark} Of the effects that are known to look similar, {', '.join(compared_similar)} "
-        f"{was_or_were} compared and had less evidence."
+        f"{remark} Of the effects that are known to look similar, {listing(names)} {was_or_were} "
+        "compared and had less evidence."
     )
 
 

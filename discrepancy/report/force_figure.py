@@ -144,6 +144,8 @@ def free_shape(missing: MissingForce, variable: Variable) -> FreeShape:
     """
     x, force = _joined(missing, variable, "force")
     edges = np.linspace(x.min(), x.max(), MOST_BINS + 1)
+    if x.min() < 0.0 < x.max():
+        edges[1 + int(np.argmin(np.abs(edges[1:-1])))] = 0.0  # a force may change with the sign
     stretch_of_sample = np.clip(np.searchsorted(edges, x) - 1, 0, MOST_BINS - 1)
     rows = []
     for stretch in range(MOST_BINS):

@@ -214,9 +214,9 @@ def test_a_law_with_a_free_shape_has_the_name_of_its_family(tmp_path):
     investigation = Investigation(problem.campaign, problem.model, (), verdict)
     intervals = [primitive_intervals(effect.patch) for effect in effects]
     sentence = size_sentence(investigation, effects, intervals)
-    assert sentence.startswith("In SI units: force ")
+    assert sentence.startswith("Size: ")
     twice = size_sentence(investigation, effects * 2, intervals * 2)
-    assert twice.startswith(f"In SI units: {family}, force ")
+    assert twice.startswith(f"Size: {family}, ")
 
 
 @pytest.fixture(scope="module")
