@@ -199,8 +199,8 @@ class ScenarioEnvironment(gymnasium.Env[Float, np.int64]):
             raise gymnasium.error.ResetNeeded("the mission is over or has not begun: call reset().")
         if not self.action_space.contains(action):
             raise gymnasium.error.InvalidAction(
-                "expected the index of one of the controls "
-                f"{comma_list(self.scenario.control_names)}, got {action!r}"
+                "the action must be the index of one of the controls "
+                f"{comma_list(self.scenario.control_names)}, but it is {action!r}"
             )
         reason_of_end = ""
         try:

@@ -120,10 +120,10 @@ def watch(
         with (
             serve_metrics(metrics) as console.metrics_server,
             call_on_end_signal(watched.request_end),
-            view_beside(view, server) as begun,
+            view_beside(view, server) as show,
             console.live_display,
         ):
-            begun(folder)
+            show(folder)
             console.say_address_of_metrics()
             watched.run(lambda: console.refresh(watched.state))
     except Exception as error:
@@ -407,7 +407,7 @@ def _print_endings(outcome: "FleetOutcome") -> None:
     """Print how many twins have flown, and why some flights failed or ended early."""
     flown_text = f"{counted(outcome.twins, 'twin')} in {outcome.seconds:.3g} s"
     if outcome.shards_kept:
-        flown_text += f", {counted(outcome.shards_kept, 'shard')} there before"
+        flown_text += f", {counted(outcome.shards_kept, 'shard')} flown before"
     endings = f"{len(outcome.failures)} failed in flight"
     if outcome.ended:
         endings += f", {len(outcome.ended)} ended early"
@@ -421,6 +421,7 @@ def _print_endings(outcome: "FleetOutcome") -> None:
 
 
 def _write_report(folder: Path) -> None:
+    """Write the report of a fleet, and show meanwhile that it is written."""
     from twin_master.fleet.page.report import write_fleet_report
 
     with terminal.progress().stage("Writing the report"):
@@ -476,14 +477,14 @@ def view_beside(
 
     process: multiprocessing.process.BaseProcess | None = None
 
-    def begin(folder: Path) -> None:
+    def show(folder: Path) -> None:
         nonlocal process
         context = multiprocessing.get_context("spawn")
         process = context.Process(target=_serve_mission, args=(folder, server), daemon=True)
         process.start()
 
     try:
-        yield begin
+        yield show
         if process is not None and process.is_alive():
             # The user may press Ctrl-C as soon as the sentence is printed.
             with suppress(KeyboardInterrupt):

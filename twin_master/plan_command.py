@@ -313,7 +313,7 @@ def design(
     separations = level_separations(knowledge, readings, candidate_indices)
     for (factor, level), separation in separations.items():
         if separation < 1.0:
-            not_separated.append(_levels_in_words(knowledge, factor, level))
+            not_separated.append(_neighbouring_levels(knowledge, factor, level))
     record: Record = {
         "sensors": chosen_titles,
         "information": list(choice.information),
@@ -371,13 +371,14 @@ def _print_design(record: Record, candidates: int) -> None:
     terminal.say(f"All {candidates} candidates: {record['of_all']:.3f} bit.")
     for levels in record["not_separated"]:
         terminal.say(
-            f"No gauge separates {levels}: less than one standard deviation by all candidates."
+            f"No gauge separates {levels}: all candidates together see less than one standard "
+            "deviation between them."
         )
     for sensors, (mean, half_width) in record.get("worth", {}).items():
         terminal.say(f"Expected return, {sensors}: {mean:.4g} ± {half_width:.2g} (95 %).")
 
 
-def _levels_in_words(knowledge: "Knowledge", factor_name: str, level: int) -> str:
+def _neighbouring_levels(knowledge: "Knowledge", factor_name: str, level: int) -> str:
     """Return a level of a state factor, given by its index, and the next one in words."""
     from twin_master.scenario.section import printed_state
 

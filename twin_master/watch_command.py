@@ -169,11 +169,11 @@ def watch(
     is_broker = broker_address.is_broker(observations or "")
     is_live = follow or observations is None or observations == "-" or is_broker
 
-    with view_beside(view) as begun:
+    with view_beside(view) as show:
 
         def begin_watch(watched: "Watch") -> None:
             watches.append(watched)
-            begun(watched.folder)
+            show(watched.folder)
 
         folder = workflow.watch(
             scenario,

@@ -382,6 +382,7 @@ def _timing_record(flight: History) -> JsonObject:
 
 
 def _write_report(folder: Path) -> None:
+    """Write the report of a run."""
     from twin_master.report.page import write_report  # it loads matplotlib
 
     write_report(folder)

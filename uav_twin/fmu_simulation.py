@@ -34,8 +34,6 @@ if TYPE_CHECKING:
 
 _MOST_PANELS = 8
 """Largest number of panels of a plot."""
-
-
 _MOST_LINES = 10
 """Largest number of lines in a panel."""
 

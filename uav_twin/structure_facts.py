@@ -94,8 +94,8 @@ class StructurePart:
     ----------
     what : str
         The kind of part, such as "material".
-    set : str or None
-        The set of elements or nodes to which the part is assigned.
+    set : str
+        The set of elements or nodes to which the part is assigned; empty for a gauge.
     count : int
         How many of `of` the part has.
     of : str
@@ -106,14 +106,14 @@ class StructurePart:
 
     what: str
     name: str
-    set: str | None
+    set: str
     count: int
     of: str
     note: str = ""
 
 
 def _structure_parts(structure: Structure) -> Iterator[StructurePart]:
-    """Yield materials, damage regions, supports, loads, ports and gauges of a structure."""
+    """Yield materials, damage regions, supports, loads and ports on sets, and gauges."""
     design = structure.design
     mesh = structure.mesh
     for number, material in enumerate(design.material):
@@ -217,7 +217,7 @@ def _point_text(point: list[float]) -> str:
 def _part_row(part: JsonRecord) -> tuple[str, ...]:
     """Return the cells of a part, given as the dictionary of a `StructurePart`."""
     contents = f"{part['count']:,} {part['of']}"
-    return (part["what"], part["name"], str(part["set"]), contents, part["note"])
+    return (part["what"], part["name"], part["set"], contents, part["note"])
 
 
 def _print_load(load: JsonRecord) -> None:

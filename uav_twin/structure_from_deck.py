@@ -126,13 +126,13 @@ def _record(file: Path, report: "DeckReport") -> dict[str, object]:
 
 def _print_report(file: Path, report: "DeckReport", tolerance: float) -> None:
     """Print the structure, its agreement with CalculiX, and what is linearised or left out."""
+    from fe.solver_deck.regions import COMPARED_DENSITY
+
     terminal.say(f"{file}: {report.unknowns:,} unknowns")
     for region in report.regions:
         terminal.say(
             f"region {region.name}: {len(region.elements):,} elements of {region.set_name}"
         )
-    from fe.solver_deck.regions import COMPARED_DENSITY
-
     rows = [
         (f"displacements under {name}", f"{value:.1e}", f"{report.load_limits[name]:.0e}")
         for name, value in report.load_deviations.items()

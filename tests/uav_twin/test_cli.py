@@ -512,7 +512,7 @@ def gentle_run(library_file: Path, tmp_path_factory: pytest.TempPathFactory) -> 
 def test_a_policy_of_another_shape_and_a_misspelt_key_are_refused_and_write_nothing(tmp_path, library_file):
     folder = tmp_path / "run"
     policy = np.ones((3, 1))
-    with pytest.raises(InvalidModelError, match="expected a policy of shape"):
+    with pytest.raises(InvalidModelError, match="a policy must have the shape"):
         uav_twin.fly("level_turns", folder, {"strain_library": library_file}, policy=policy)
     with pytest.raises(MissionInputError, match="'sead' is not a key"):
         uav_twin.fly("level_turns", folder, {"sead": 1})

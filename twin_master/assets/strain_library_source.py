@@ -100,7 +100,7 @@ class StrainLibrary:
             if not levels[0] <= loss <= levels[-1]:
                 raise MissionInputError(
                     f"the strain library covers {factor.name} from {levels[0]:g} to "
-                    f"{levels[-1]:g}, got {loss:g}"
+                    f"{levels[-1]:g}, but the state has {loss:g}."
                 )
             # The weight of a level is the piecewise linear function that is 1 at this level and 0
             # at the others.
@@ -151,7 +151,7 @@ def _parse_library(content: JsonRecord) -> StrainLibrary:
     levels_by_region = content["states"]
     if len(levels_by_region) != len(REGION_NAMES):
         raise ValueError(
-            f"expected the levels of {len(REGION_NAMES)} regions under 'states', got "
+            f"'states' must have the levels of {len(REGION_NAMES)} regions, but it has those of "
             f"{len(levels_by_region)}"
         )
     controls = tuple(str(control) for control in content["controls"])

@@ -27,6 +27,15 @@ MODEL_COPY = "asset/model/structure.toml"
 """The file of the structure that the twin believes, inside a run folder."""
 
 
+def structure_file_in(run_folder: Path) -> Path | None:
+    """Return the structure file in a run folder, that of the twin's model before that of the asset.
+
+    It is None if neither is a structure.
+    """
+    files = (run_folder / name for name in (MODEL_COPY, FLOWN_COPY))
+    return next((file for file in files if file.is_file()), None)
+
+
 class StructureFiles(FileSection):
     """A table that names a structure file, and through it a mesh or matrices."""
 

@@ -39,7 +39,7 @@ class Broker:
     tls : bool
         Whether the connection is encrypted (`mqtts://`), with the certificate of the broker.
     authority : Path or None
-        The certificate of the authority, if the operating system does not have it.
+        The file with the certificate of the authority, if the operating system does not have it.
     """
 
     host: str

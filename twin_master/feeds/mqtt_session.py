@@ -48,7 +48,7 @@ Without them, heartbeats and decisions would wait until all messages are process
 _UNREAD_MESSAGES = 200
 """Largest number of messages that the broker sends before they are acknowledged."""
 _UNREAD_BYTES = 50_000_000
-"""Size of the messages that wait here at most, beyond the `_UNREAD_MESSAGES` first ones [bytes]."""
+"""Size from which on no more messages are read, if more than `_UNREAD_MESSAGES` wait [bytes]."""
 _UNACKNOWLEDGED_DECISIONS = 1000
 """Largest number of decisions sent and not acknowledged; further ones wait in the journal."""
 _SESSION_SECONDS = 7 * 86_400
@@ -94,8 +94,8 @@ class Session:
     folder : Path
         The folder of the file with the client name, which nobody else can guess.
     note : callable
-        Called with a sentence when the connection is lost or found, and when the broker refuses
-        something.
+        Called with a sentence when the connection is lost or made, and when messages come faster
+        than they are processed. Publishers call it when the broker refuses a decision.
     heartbeat : callable
         Returns the state of the twin, which is published at regular intervals.
 
@@ -301,8 +301,8 @@ class Session:
         """Drop the connection, and schedule the next attempt.
 
         A failure before the first subscription ends the watch with an error. `failure` is the cause
-        if no callback has recorded one. Messages that were not acknowledged are forgotten: the
-        broker sends them again.
+        if no callback has recorded one. Messages that wait here are forgotten: they were not
+        acknowledged, so that the broker sends them again.
         """
         failure = self._failure or failure
         self._failure = ""
@@ -314,7 +314,7 @@ class Session:
         self._reported_failure = failure
         self._next_attempt = time.monotonic() + self._retry_seconds
         self._retry_seconds = min(2.0 * self._retry_seconds, LONGEST_RETRY_SECONDS)
-        self.unread.clear()  # they were not acknowledged, so that the broker sends them again
+        self.unread.clear()
         self._last_message = None
         for publisher in set(self._publisher_of_message.values()):
             publisher.resend_unacknowledged()

@@ -50,8 +50,8 @@ _NORMAL_HALF_WIDTH = 1.6448536269514722
 """Half-width of the central 90 % of a normal distribution, in standard deviations."""
 
 
-class ParameterDraws(NamedTuple):
-    """The calibrated parameter: its name, and the value of each draw (E,)."""
+class LearntParameter(NamedTuple):
+    """The calibrated parameter, if it is learnt: its name, and the value of each draw (E,)."""
 
     name: str
     values: ArrayLike
@@ -149,7 +149,7 @@ class LearningFilter:
         self.model = model
         self.sensor_model = sensor_model
         self._words = words or NoticeWording()
-        self.parameter = None if draws is None else ParameterDraws(*draws)
+        self.parameter = None if draws is None else LearntParameter(*draws)
         self._name = name
         self._transition_factors = np.array(list(transitions))
 

@@ -239,7 +239,8 @@ def choose_sensors(
     """
     if not 1 <= count <= len(candidates):
         raise MissionInputError(
-            f"--sensors is from 1 to {len(candidates)}, the candidates, but {count} was given."
+            f"--sensors must be from 1 to {len(candidates)}, the number of candidates, but {count} "
+            "was given."
         )
     chosen_sensors = _add_greedily(readings, candidates, count)
     chosen_sensors = _exchange(readings, candidates, chosen_sensors)
@@ -427,7 +428,7 @@ def _extensible_structure(scenario: Scenario) -> tuple[StructureBelief, MeshDesi
         design = load_structure(belief.all_files()[MODEL_COPY])
         if isinstance(design, MeshDesign):
             return belief, design
-    raise MissionInputError("--candidates needs a structure from a mesh as what is believed.")
+    raise MissionInputError("--candidates needs a twin that believes a structure from a mesh.")
 
 
 def _with_all_gauges(

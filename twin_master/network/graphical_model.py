@@ -49,8 +49,8 @@ class Factor:
             raise InvalidModelError("a factor of the state space needs a name, got an empty one")
         if not levels or not np.all(np.isfinite(levels)) or np.any(np.diff(levels) <= 0.0):
             raise InvalidModelError(
-                f"factor {self.name!r}: expected one or more finite, strictly increasing levels, "
-                f"got {comma_list(levels)}"
+                f"the factor {self.name!r} must have one or more finite, strictly increasing "
+                f"levels, but they are {comma_list(levels)}"
             )
 
     @property
@@ -130,7 +130,8 @@ class StateSpace:
         """
         if len(levels) != len(self.factors):
             raise InvalidModelError(
-                f"expected one level for each of {self.names}, got {tuple(levels)}"
+                f"a state must have one level for each of {comma_list(self.names)}, but "
+                f"{comma_list(levels)} was given"
             )
         pairs = zip(self.factors, levels, strict=True)
         indices = [factor.index(value) for factor, value in pairs]
@@ -378,7 +379,7 @@ def _check_factor_names(
     """Refuse a table that does not have one entry for each factor."""
     if set(rows) != set(levels):
         raise InvalidModelError(
-            f"{table}: expected one table for each of the factors {comma_list(levels)}, got "
+            f"{table} must have one table for each of the factors {comma_list(levels)}, but it has "
             f"{comma_list(rows)}"
         )
 

@@ -125,8 +125,8 @@ class IdentifiedSensorModel(GaussianSensorModel):
         count = self.sensor_count
         if len(row) not in (count, row_width(count)) or np.isinf(row).any():
             raise InvalidObservationError(
-                f"expected {count} finite values, or {row_width(count)} with their covariance, got "
-                f"{len(row)}"
+                f"an observation must have {count} finite values, or {row_width(count)} with their "
+                f"covariance, but this one has {len(row)}"
             )
         covariance = np.zeros((count, count))
         if len(row) > count:
@@ -220,8 +220,9 @@ class InspectedSensorModel(GaussianSensorModel):
             return values, np.zeros((*readings.shape[:-1], self.state_count))
         if readings.shape[-1] != inspection_count or np.isinf(readings).any():
             raise InvalidObservationError(
-                f"expected {sensor_count} finite values, or {sensor_count + inspection_count} with "
-                f"the readings of inspections, got {rows.shape[-1]}"
+                f"an observation must have {sensor_count} finite values, or "
+                f"{sensor_count + inspection_count} with the readings of inspections, but this one "
+                f"has {rows.shape[-1]}"
             )
         # Gaussian log densities (..., S, I) of each reading in each state
         residual = (readings[..., None, :] - self.expected_reading) / self.reading_deviation

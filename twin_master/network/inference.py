@@ -155,6 +155,8 @@ def filter_many(
 
     Returns
     -------
+    result : Filtered
+        The beliefs, with axes (B, T, S), and the log evidence (B, T).
     failed : (B,) array
         The first step whose observation is impossible, or -1. Later beliefs of such a twin are not
         defined.
@@ -304,7 +306,7 @@ def predict(
     policy = nan_where_masked(policy)
     check_shape("a belief", belief.shape, model.states.size)
     if horizon < 0:
-        raise InvalidModelError(f"expected a horizon of 0 or more steps, got {horizon}")
+        raise InvalidModelError(f"the horizon must be 0 steps or more, but it is {horizon}")
     predicted_beliefs = np.empty((horizon, len(belief)))
     if horizon > 0:
         predicted_beliefs[0] = model.transition.forward(control_index, belief)

@@ -56,7 +56,7 @@ class BeliefPolicy:
     def __post_init__(self) -> None:
         if not np.all(np.isfinite(nan_where_masked(self.vectors))):
             raise PlanningError(
-                "expected finite returns of plans, got NaN, masked or infinite ones"
+                "the returns of plans must be finite, but some are NaN, masked or infinite"
             )
         control = checked_controls(self.control, np.iinfo(np.int64).max)
         object.__setattr__(self, "control", control)
@@ -86,8 +86,8 @@ class BeliefPolicy:
         is_integer = control.dtype.kind in "iu"
         if vectors.ndim != 2 or control.shape != vectors.shape[:1] or not is_integer:
             raise PlanningError(
-                "expected vectors (N, S) and a control for each, got "
-                f"{comma_list(vectors.shape)} and {comma_list(control.shape)}"
+                "a policy must have vectors (N, S) and a control for each, but their shapes are "
+                f"({comma_list(vectors.shape)}) and ({comma_list(control.shape)})"
             )
         return cls(np.asarray(vectors, dtype=np.float64), np.asarray(control, dtype=np.int64))
 
@@ -364,8 +364,8 @@ class _DecisionProcess:
         in_range = np.all((factors >= 0.0) & (factors < 1.0))
         if factors.shape not in ((), (controls,)) or not in_range:
             raise PlanningError(
-                f"expected a discount factor in [0, 1), or one for each of {controls} controls, "
-                f"got {factors}"
+                f"there must be one discount factor in [0, 1), or one for each of {controls} "
+                f"controls, but {factors} was given"
             )
         if factors.max() > _LARGEST_DISCOUNT:
             raise PlanningError(

@@ -123,13 +123,15 @@ class QuantityModel:
         values = np.array(nan_where_masked(value_per_draw), order="C")
         check_shape("values", values.shape, "draws", "states", "controls", "sensors")
         if values.size == 0:
-            raise InvalidModelError(f"expected one value or more, got the shape {values.shape}")
+            raise InvalidModelError(
+                f"there must be one value or more, but the array has the shape {values.shape}"
+            )
         is_finite = np.isfinite(values)
         if not np.all(is_finite):
             position = tuple(int(i) for i in np.argwhere(~is_finite)[0])
             raise InvalidModelError(
-                f"value at (draw, state, control, sensor) {position} is {values[position]}; "
-                "expected finite values"
+                f"the value at (draw, state, control, sensor) {position} is {values[position]}, "
+                "but values must be finite"
             )
         values.setflags(write=False)
         self.value_per_draw: Float = values
@@ -215,7 +217,9 @@ class QuantityModel:
         is_increasing = levels.ndim == 1 and not np.any(np.diff(levels) < 0)
         is_probability = (levels > 0.0) & (levels <= 1.0)
         if not is_increasing or not np.all(is_probability):
-            raise InvalidModelError(f"expected increasing quantile levels in (0, 1], got {levels}")
+            raise InvalidModelError(
+                f"the levels of quantiles must increase and lie in (0, 1], but they are {levels}"
+            )
         weight = joint.reshape(-1, self.state_count * self.control_count)
         weight = np.require(weight, np.float64, ["C", "W"])  # as the compiled loop expects it
         result = np.empty((len(weight), len(levels), self.sensor_count))

@@ -167,7 +167,7 @@ class GaussianSensorModel(QuantityModel):
             self.interval = np.array(nan_where_masked(interval))
         check_shape("changes within intervals", self.interval.shape, *independent.shape, "factors")
         if not np.all(np.isfinite(self.interval)):
-            raise InvalidModelError("expected finite changes within intervals")
+            raise InvalidModelError("the changes within intervals must be finite")
         self.independent_standard_deviation = independent
         self.total_standard_deviation = np.hypot(
             independent, np.linalg.norm(self.interval, axis=-1)
@@ -193,7 +193,8 @@ class GaussianSensorModel(QuantityModel):
         has_shape = value.shape in ((), (self.sensor_count,))
         if not has_shape or not np.all(np.isfinite(value) & is_valid):
             raise InvalidModelError(
-                f"expected one {what}, or one for each of {self.sensor_count} sensors, got {value}"
+                f"there must be one {what}, or one for each of {self.sensor_count} sensors, but "
+                f"{value} was given"
             )
 
     @property

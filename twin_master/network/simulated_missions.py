@@ -14,7 +14,8 @@ Decide = Callable[[Float, Float, int], Index]
 """Returns the controls (B,) of a step, given two beliefs (B, S) and the number of the step, from 0.
 
 The first belief is about the states in the step, the second about those in the step before; both
-are given all observations up to the step before.
+are given all observations up to the step before. In the first step both are the prior; in a problem
+whose state moves before it is observed, both are always the same.
 """
 
 

@@ -54,7 +54,7 @@ def stochastic_matrix(rows: ArrayLike, *, name: str) -> Float:
     matrix = np.array(nan_where_masked(rows), order="C")
     if matrix.ndim == 0 or matrix.size == 0:
         raise InvalidModelError(
-            f"{name}: expected rows of probabilities, got an array of shape {matrix.shape}"
+            f"{name} must be rows of probabilities, but it has the shape {matrix.shape}"
         )
     is_infinite = np.asarray(~np.isfinite(matrix).all(axis=-1))
     _check_rows(matrix, is_infinite, name, "holds a value that is not finite")
@@ -122,7 +122,7 @@ def check_shape(
         lengths = ", ".join(map(str, expected))
         if len(expected) == 1:
             lengths += ","  # as Python writes a tuple of one entry
-        raise error(f"expected {what} of shape ({lengths}), got {tuple(shape)}")
+        raise error(f"{what} must have the shape ({lengths}), but the shape is {tuple(shape)}")
 
 
 def checked_controls(control_index: ArrayLike, count: int) -> Index:
@@ -137,14 +137,15 @@ def checked_controls(control_index: ArrayLike, count: int) -> Index:
     is_whole = numbers == np.round(numbers)  # false for NaN as well
     if not np.all(is_whole):
         raise InvalidModelError(
-            "expected whole numbers as control indices, got "
+            "the indices of controls must be whole numbers, but one is "
             f"{numbers[~is_whole].flat[0]} (NaN stands for a masked one)"
         )
     low = np.min(numbers, initial=0)
     high = np.max(numbers, initial=0)
     if low < 0 or high >= count:
         raise InvalidModelError(
-            f"expected control indices between 0 and {count - 1}, got {low:.0f} to {high:.0f}"
+            f"the indices of controls must be from 0 to {count - 1}, but they are from {low:.0f} "
+            f"to {high:.0f}"
         )
     return np.array(numbers, dtype=np.int64, order="C")
 
@@ -161,7 +162,7 @@ def checked_beliefs(beliefs: ArrayLike) -> Float:
     is_finite = np.isfinite(probabilities)
     if not np.all(is_finite):
         raise InvalidModelError(
-            "expected the probability of each state in a belief, got "
+            "a belief must have the probability of each state, but one is "
             f"{probabilities[~is_finite].flat[0]} (NaN stands for a masked one)"
         )
     return probabilities
@@ -263,7 +264,8 @@ class TransitionModel:
         control_counts = [len(block) for block in checked]
         if len(set(control_counts)) != 1:
             raise InvalidModelError(
-                f"transition: every block needs the same controls, got {comma_list(control_counts)}"
+                "the blocks of a transition must have the same controls, but their numbers of "
+                f"controls are {comma_list(control_counts)}"
             )
         object.__setattr__(self, "blocks", checked)
 

@@ -169,8 +169,8 @@ def _prior_range(record: JsonRecord) -> tuple[float, float]:
     prior = record.get("prior", {})
     if not prior.get("standard_deviation") or "range" not in prior:
         return -np.inf, np.inf
-    lowest, highest_value = prior["range"]
-    return lowest, highest_value
+    lowest, highest = prior["range"]
+    return lowest, highest
 
 
 def _draw_prior(axes: Axes, record: JsonRecord, low: float, high: float) -> None:

@@ -36,8 +36,8 @@ def opening_sentences(run: Run) -> tuple[str, ...]:
 
 
 @dataclass(frozen=True)
-class _PolicySwitch:
-    """The level of a state factor from which on the policy leaves the initial control.
+class _SwitchInWords:
+    """The level of a state factor from which on the policy leaves the initial control, in words.
 
     Attributes
     ----------
@@ -72,7 +72,7 @@ def _decision_sentence(run: Run) -> str:
             run.control_index,
             run.true_state,
         )
-    switch = _policy_switch(run, fallback)
+    switch = _switch_in_words(run, fallback)
     fell_back = fallback.fallback_step is not None and fallback.early_change_step is None
     if fell_back and switch is not None and not switch.is_always_reached:
         sentence = _fallback_clause(run, fallback, switch)
@@ -90,7 +90,7 @@ def _decision_sentence(run: Run) -> str:
     return f"{sentence}."
 
 
-def _policy_switch(run: Run, fallback: Fallback) -> _PolicySwitch | None:
+def _switch_in_words(run: Run, fallback: Fallback) -> _SwitchInWords | None:
     """Return the level at which the policy leaves the initial control; None if there is none."""
     if fallback.switch_factor is None or fallback.switch_level is None:
         return None
@@ -104,7 +104,7 @@ def _policy_switch(run: Run, fallback: Fallback) -> _PolicySwitch | None:
         slack = run.model.states.factors[factor_index].slack
         if true_value < fallback.switch_level - slack:
             level_text += " (to the nearest level)"
-    return _PolicySwitch(
+    return _SwitchInWords(
         factor=_with_article(factor.title),
         level=level_text,
         is_always_reached=level <= factor.levels[0],
@@ -121,7 +121,7 @@ def _changes_of_control(run: Run) -> str:
     return control_changes(run.controls, run.control_index, run.step_word, run.first_step)
 
 
-def _fallback_clause(run: Run, fallback: Fallback, switch: _PolicySwitch) -> str:
+def _fallback_clause(run: Run, fallback: Fallback, switch: _SwitchInWords) -> str:
     """Return the clause on the step of the fallback and on the delay from the damage to it."""
     row = fallback.fallback_step
     assert row is not None
@@ -139,7 +139,7 @@ def _fallback_clause(run: Run, fallback: Fallback, switch: _PolicySwitch) -> str
     return f"{fell_back} {time_text} {switch.factor} had reached {switch.level}"
 
 
-def _switch_clause(run: Run, fallback: Fallback, switch: _PolicySwitch | None) -> str:
+def _switch_clause(run: Run, fallback: Fallback, switch: _SwitchInWords | None) -> str:
     """Return the clause on the step in which the damage reached the level of another control.
 
     The clause depends on the policy, where 2g is the initial control:

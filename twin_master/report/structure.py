@@ -16,7 +16,7 @@ from reporting.arrays import Float, Index
 from reporting.pages import figures as style
 from twin_master.assets.design_source import DESIGN_COPY, FLOWN_DESIGN_COPY
 from twin_master.assets.reduced_model import FIELD_NAME
-from twin_master.assets.structure_source import FLOWN_COPY, MODEL_COPY
+from twin_master.assets.structure_source import structure_file_in
 from twin_master.report.reading import Run
 from twin_master.scenario.mission import CALIBRATION_COPY
 from twin_master.scenario.schema import Scenario
@@ -341,9 +341,7 @@ def mesh_figure(run_folder: Path, residual: Float) -> StructurePicture:
         1, 1, 0.55 * style.FULL_WIDTH, 0.05, 0.05, left=0.1, right=0.9
     )
     surface = _draw_surface(axes, field, displaced_points, camera)
-    # The structure of the twin's model is preferred to that of the asset.
-    structure_files = (run_folder / name for name in (MODEL_COPY, FLOWN_COPY))
-    gauges = gauge_places(next((file for file in structure_files if file.is_file()), None))
+    gauges = gauge_places(structure_file_in(run_folder))
     if gauges is not None and len(gauges) == len(residual):
         distance = np.linalg.norm(points[:, None] - gauges, axis=2)  # (nodes, gauges)
         nearest_node = np.argmin(distance, axis=0)

@@ -28,7 +28,7 @@ from twin_master.scenario.section import (
 )
 
 ROW_SUM_TOLERANCE = 1e-12
-"""Largest departure of a sum of probabilities from one; the graphical model has the same."""
+"""Largest departure of a sum of probabilities from one."""
 
 
 class SummaryKeys(NamedTuple):
@@ -164,7 +164,7 @@ class Span(Section):
     later steps."""
 
     def checks(self) -> Iterator[Check]:
-        """Yield (has failed, message) for each rule on an early end."""
+        """Yield (has failed, message) for a last step before the first one."""
         ends_early = self.last_step is not None and self.last_step < self.first_step
         yield (
             ends_early,

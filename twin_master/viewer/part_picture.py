@@ -8,7 +8,7 @@ import numpy as np
 from fe.structure.design import MeshDesign, load_structure
 from fe.structure.operators import structure_mesh
 from reporting.arrays import Float
-from twin_master.assets.structure_source import FLOWN_COPY, MODEL_COPY
+from twin_master.assets.structure_source import structure_file_in
 from twin_master.report.structure import structure_camera
 from twin_master.scenario.schema import Scenario
 
@@ -51,11 +51,13 @@ def part_picture(folder: Path, scenario: Scenario) -> PartPicture | None:
     scenario : Scenario
         The scenario, which defines the sensors and the factors of the state.
     """
-    files = [folder / name for name in (MODEL_COPY, FLOWN_COPY) if (folder / name).is_file()]
-    design = load_structure(files[0]) if files else None
+    file = structure_file_in(folder)
+    if file is None:
+        return None
+    design = load_structure(file)
     if not isinstance(design, MeshDesign) or len(design.gauge) != scenario.observation.count:
         return None
-    mesh = structure_mesh(design, files[0])
+    mesh = structure_mesh(design, file)
     region_of_cell = np.full(len(mesh.cells), NO_REGION)
     for damage in design.damage:
         if damage.name in scenario.state_names:

@@ -162,7 +162,7 @@ def _with_comments(campaign: str) -> str:
 
 
 def _write_simulated_campaign(model_file: Path, folder: Path) -> None:
-    """Write ring-downs and a load test of the model, with friction hidden at its slide."""
+    """Write a campaign of simulated ring-downs of the model, with friction hidden at its slide."""
     model = choose_model(str(model_file)).model
     plan = usual_plan(model)
     plan = replace(plan, duration=0.5 * plan.duration)

@@ -159,7 +159,7 @@ def test_a_library_of_one_region_is_linear_between_its_levels(library_of_one_reg
 
 
 def test_another_level_than_the_only_one_is_refused(library_of_one_region):
-    with pytest.raises(MissionInputError, match=r"covers z2 from 0 to 0, got 0\.1"):
+    with pytest.raises(MissionInputError, match=r"covers z2 from 0 to 0, but the state has 0\.1"):
         library_of_one_region.strain_at((0.07, 0.1), 1)
 
 

@@ -185,5 +185,5 @@ def test_twins_with_a_sensor_model_of_ones_own_fly_the_same_side_by_side(library
 
 def test_a_sensor_model_with_likelihoods_of_fewer_states_is_refused(library_file):
     fleet = with_sensor_model(watched_fleet("level_turns", library_file), Misshapen)
-    with pytest.raises(InvalidModelError, match="log-likelihood of shape"):
+    with pytest.raises(InvalidModelError, match="log-likelihood must have the shape"):
         fleet.fly_together()

@@ -507,7 +507,7 @@ def test_our_policy_flies_the_mission_of_the_loop(environment):
     with pytest.raises(gymnasium.error.ResetNeeded, match="call reset"):
         environment.step(0)
     environment.reset(seed=1)
-    with pytest.raises(gymnasium.error.InvalidAction, match="controls 2g, 3g, got 2"):
+    with pytest.raises(gymnasium.error.InvalidAction, match="controls 2g, 3g, but it is 2"):
         environment.step(2)
     environment.close()
     with pytest.raises(MissionInputError, match="is closed"):

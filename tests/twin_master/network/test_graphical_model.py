@@ -121,7 +121,7 @@ def test_a_model_from_tables(monkeypatch, most):
     priors = {"a": (0.25, 0.75), "b": (0.5, 0.5, 0.0), "c": (0.0, 1.0)}
     given = GraphicalModel.from_tables(levels, tables, priors)
     np.testing.assert_array_equal(given.prior, np.kron(np.kron(priors["a"], priors["b"]), priors["c"]))
-    with pytest.raises(InvalidModelError, match="hard: expected one table for each of the factors a, b, c"):
+    with pytest.raises(InvalidModelError, match="hard must have one table for each of the factors a, b, c"):
         GraphicalModel.from_tables(levels, {**tables, "hard": {"a": worse}})
 
 
@@ -282,19 +282,19 @@ REFUSED = [
     (lambda: StateSpace((Factor("z", LEVELS), Factor("z", LEVELS))), "different names"),
     (lambda: StateSpace(()), "different names"),
     (lambda: Factor("", LEVELS), "needs a name"),
-    (lambda: TransitionModel((np.full((2, 3, 4), 0.25),)), r"a transition of shape \(controls, 4, 4\)"),
+    (lambda: TransitionModel((np.full((2, 3, 4), 0.25),)), r"must have the shape \(controls, 4, 4\)"),
     (
         lambda: TransitionModel.from_factors([[np.eye(2)], [np.eye(3)]]),
         "one square table for each factor, of the same size",
     ),
     (lambda: TransitionModel.from_factors([[[[0.5, 0.5]]]]), "square table"),
     (lambda: TransitionModel.from_factors([[]]), "square table"),
-    (lambda: GraphicalModel(SPACE, ("2g", "3g"), PRIOR, MOVES), r"a transition of shape \(2, 15, 15\)"),
+    (lambda: GraphicalModel(SPACE, ("2g", "3g"), PRIOR, MOVES), r"must have the shape \(2, 15, 15\)"),
     (lambda: GraphicalModel(SPACE, (), PRIOR, MOVES), "different names"),
-    (lambda: GraphicalModel(SPACE, ("hold",), PRIOR[:-1], MOVES), r"expected prior of shape \(15,\)"),
+    (lambda: GraphicalModel(SPACE, ("hold",), PRIOR[:-1], MOVES), r"prior must have the shape \(15,\)"),
     (lambda: GraphicalModel(SPACE, ("hold",), 2 * PRIOR, MOVES), "prior: the distribution does not sum to"),
-    (lambda: MODEL.policy([[0.5, 0.4, 0.1]] * 25), r"a policy of shape \(25, 2\)"),
-    (lambda: TransitionModel((np.eye(2)[None], np.stack([np.eye(3)] * 2))), "the same controls"),
+    (lambda: MODEL.policy([[0.5, 0.4, 0.1]] * 25), r"a policy must have the shape \(25, 2\)"),
+    (lambda: TransitionModel((np.eye(2)[None], np.stack([np.eye(3)] * 2))), "same controls"),
     (lambda: stochastic_matrix([[1.0, 0.0], [0.5, 0.5 + 1e-11]], name="T"), "T: row 1 does not sum to one"),
     (lambda: stochastic_matrix([[1.0, 0.0], [1.5, -0.5]], name="T"), "T: row 1 holds a negative probability"),
     (lambda: stochastic_matrix([[1.0, 0.0], [np.nan, 1.0]], name="T"), "T: row 1 holds a value that is not"),
@@ -306,16 +306,16 @@ REFUSED = [
     (lambda: stochastic_matrix([], name="T"), "shape"),
     (lambda: filter_sequence(MODEL, [1] * 3, np.where(AT_1_7, np.nan, 0.0)), r"likelihood at \(1, 7\)"),
     (lambda: filter_sequence(MODEL, [1] * 3, np.where(AT_1_7, np.inf, 0.0)), r"likelihood at \(1, 7\)"),
-    (lambda: filter_sequence(MODEL, [1, 1], ZEROS), r"of shape \(2, 25\)"),
-    (lambda: filter_sequence(MODEL, [1, 2], ZEROS[:2]), "between 0 and 1"),
-    (lambda: filter_sequence(MODEL, [1, 0.5], ZEROS[:2]), "whole numbers as control indices, got 0.5"),
+    (lambda: filter_sequence(MODEL, [1, 1], ZEROS), r"must have the shape \(2, 25\)"),
+    (lambda: filter_sequence(MODEL, [1, 2], ZEROS[:2]), "from 0 to 1"),
+    (lambda: filter_sequence(MODEL, [1, 0.5], ZEROS[:2]), "must be whole numbers, but one is 0.5"),
     (lambda: filter_sequence(MODEL, np.ma.masked_equal([0, 1], 1), ZEROS[:2]), "whole numbers"),
     (lambda: filter_sequence(MODEL, [1] * 3, np.ma.masked_where(AT_1_7, ZEROS)), r"likelihood at \(1, 7\)"),
     (lambda: predict(MODEL, np.ones(25), 0.5, POLICY, 1), "whole numbers"),
-    (lambda: filter_sequence(MODEL, 1, ZEROS[0]), r"controls of shape \(1,\), got \(\)"),
-    (lambda: smooth(MODEL, [[1]], ZEROS[None, :1]), r"controls of shape \(1,\), got \(1, 1\)"),
-    (lambda: predict(MODEL, np.ones(3), 0, POLICY, 1), r"belief of shape \(25,\)"),
-    (lambda: predict(MODEL, np.ones(25), 0, POLICY, -1), "horizon of 0 or more"),
+    (lambda: filter_sequence(MODEL, 1, ZEROS[0]), r"shape \(1,\), but the shape is \(\)"),
+    (lambda: smooth(MODEL, [[1]], ZEROS[None, :1]), r"shape \(1,\), but the shape is \(1, 1\)"),
+    (lambda: predict(MODEL, np.ones(3), 0, POLICY, 1), r"belief must have the shape \(25,\)"),
+    (lambda: predict(MODEL, np.ones(25), 0, POLICY, -1), "the horizon must be 0 steps or more"),
 ]
 
 

@@ -57,7 +57,7 @@ def test_a_masked_reading_is_a_lost_one(control):
 def test_a_control_between_two_controls_is_refused():
     _, values, _, deviation, observation = random_sensors(0)
 
-    with pytest.raises(InvalidModelError, match=r"whole numbers as control indices, got 0\.5"):
+    with pytest.raises(InvalidModelError, match=r"must be whole numbers, but one is 0\.5"):
         GaussianSensorModel(values, deviation).log_likelihood(observation, 0.5)
 
 
@@ -146,7 +146,7 @@ class OfOneState(GaussianSensorModel):
 def test_a_likelihood_of_other_states_is_refused_in_many_rows():
     _, values, _, deviation, observation = random_sensors(0)
 
-    with pytest.raises(InvalidModelError, match=rf"log-likelihood of shape \({STATES},\)"):
+    with pytest.raises(InvalidModelError, match=rf"log-likelihood must have the shape \({STATES},\)"):
         OfOneState(values, deviation).log_likelihood_sequence([observation], [0])
 
 
@@ -532,19 +532,19 @@ REFUSED = [
     *((lambda bad=bad: GaussianSensorModel(SHOWN, 1.0, SHARE, model_error=bad), "relative model error")
       for bad in (-0.1, np.nan, np.inf, np.ones(SENSORS + 1))),
     (lambda: GaussianSensorModel(np.zeros((1, 2, 1, 1)), 1.0, interval=np.ones((2, 1, 1))),
-     r"intervals of shape \(2, 1, 1, factors\), got \(2, 1, 1\)"),
-    (lambda: HOLDING.log_likelihood(OBSERVATION[:-1], 0), rf"sensor values of shape \({SENSORS},\)"),
+     r"intervals must have the shape \(2, 1, 1, factors\), but the shape is \(2, 1, 1\)"),
+    (lambda: HOLDING.log_likelihood(OBSERVATION[:-1], 0), rf"values must have the shape \({SENSORS},\)"),
     (lambda: HOLDING.log_likelihood(np.r_[OBSERVATION[:3], -np.inf, 0.0, 0.0], 0), r"\(3,\) is infinite"),
-    (lambda: HOLDING.log_likelihood(OBSERVATION, 2), "control indices between 0 and 1"),
-    (lambda: HOLDING.log_likelihood_sequence(OBSERVATION[None], [0, 1]), r"observations of shape \(2, 6\)"),
+    (lambda: HOLDING.log_likelihood(OBSERVATION, 2), "indices of controls must be from 0 to 1"),
+    (lambda: HOLDING.log_likelihood_sequence(OBSERVATION[None], [0, 1]), r"must have the shape \(2, 6\)"),
     (lambda: QuantityModel(VALUES[0]), r"\(draws, states, controls, sensors\)"),
     (lambda: QuantityModel(HOLED), r"\(0, 1, 0, 2\) is nan"),
     (lambda: QuantityModel(VALUES, WEIGHT * 2), "draw weights"),
     (lambda: QUANTITY.moments(JOINT[:, :, 0]), "known_control"),
-    *((lambda bad=bad: QUANTITY.quantiles(JOINT, bad), "increasing quantile levels")
+    *((lambda bad=bad: QUANTITY.quantiles(JOINT, bad), "levels of quantiles must increase")
       for bad in ([0.9, 0.1], [0.0], [1.1], 0.5, [np.nan])),
     (lambda: REWARDS.expectation(JOINT[1, 0]), "joint belief"),
-    (lambda: value_iteration(MOVES, REWARD.T, 0.6), "rewards of shape"),
+    (lambda: value_iteration(MOVES, REWARD.T, 0.6), "rewards must have the shape"),
     *((lambda bad=bad: value_iteration(MOVES, REWARD, bad), r"discount factor in \[0, 1\)")
       for bad in (1.0, -0.1, np.nan)),
     (lambda: value_iteration(MOVES, REWARD, 1.0 - 1e-15), "so close to 1 that rounding decides"),
@@ -554,11 +554,11 @@ REFUSED = [
     (lambda: value_iteration(MOVES, np.ma.masked_equal(REWARD, REWARD[2, 1]), 0.6), r"\(2, 1\) is nan"),
     (lambda: value_iteration(np.ma.masked_equal(TABLE, TABLE[0, 0, 0]), REWARD, 0.6), "a value that is not"),
     (lambda: value_iteration(MOVES, REWARD, np.ma.masked_equal([0.6, 0.7, 0.6], 0.7)), "discount factor"),
-    (lambda: BeliefPolicy(np.ma.masked_equal(np.eye(2), 1.0), [0, 1]), "finite returns of plans"),
-    (lambda: BeliefPolicy(np.eye(2), [0.0, 1.5]), r"whole numbers as control indices, got 1\.5"),
+    (lambda: BeliefPolicy(np.ma.masked_equal(np.eye(2), 1.0), [0, 1]), "returns of plans must be finite"),
+    (lambda: BeliefPolicy(np.eye(2), [0.0, 1.5]), r"must be whole numbers, but one is 1\.5"),
     *((lambda ask=ask: ask(np.ma.masked_equal([0.2, 0.3, 0.5], 0.3)), "NaN stands for a masked one")
       for ask in (PLANS.decide, PLANS.value, lambda belief: PLANS.action_value(belief, 2))),
-    (lambda: known_control(np.ones(3) / 3, 1.5, 2), r"whole numbers as control indices, got 1\.5"),
+    (lambda: known_control(np.ones(3) / 3, 1.5, 2), r"must be whole numbers, but one is 1\.5"),
 ]  # fmt: skip
 
 

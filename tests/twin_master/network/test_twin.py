@@ -285,9 +285,7 @@ def test_a_twin_of_an_own_sensor_model_predicts_and_refuses_what_is_impossible(o
         own_twin.step(np.full(24, 1e300))
 
 
-@pytest.mark.parametrize(
-    ("control", "sentence"), [("4g", "no control is named '4g'"), (2, "between 0 and 1")]
-)
+@pytest.mark.parametrize(("control", "sentence"), [("4g", "no control is named '4g'"), (2, "from 0 to 1")])
 def test_a_control_that_a_twin_does_not_have_is_refused(own_twin, seen, control, sentence):
     with pytest.raises(InvalidModelError, match=sentence):
         own_twin.step(seen[0], control)

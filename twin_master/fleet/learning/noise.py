@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -24,9 +23,6 @@ from twin_master.fleet.learning.parameter_evidence import parameter_evidence
 from twin_master.fleet.reading import TwinsOfScenario
 from twin_master.fleet.storage.store_layout import StoredObservations
 from twin_master.network.sensor_model import GaussianSensorModel
-
-if TYPE_CHECKING:
-    pass
 
 NOISE_TWINS = 100
 """Largest number of twins of a group from which the noise is learnt.
