@@ -11,7 +11,7 @@ of a patch, the changes of the solutions under loads, of those under outputs as 
 modes are added.
 """
 
-from dataclasses import fields
+from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
@@ -84,7 +84,7 @@ def with_changes(yielding: AffineStructure, reduction: Reduction) -> ChangeableM
 
     The columns of all changes are refined once, and those of changes whose largest error exceeds
     `LARGEST_ERROR` again, at most `MOST_REFINEMENTS` times in all. `change_errors` of the model has
-    the errors that are left.
+    the remaining errors.
 
     Parameters
     ----------
@@ -116,8 +116,7 @@ def with_changes(yielding: AffineStructure, reduction: Reduction) -> ChangeableM
         inexact = np.flatnonzero(~(errors <= LARGEST_ERROR)).tolist()
         if not inexact:
             break
-    values = {field.name: getattr(model, field.name) for field in fields(ChangeableModel)}
-    return ChangeableModel(**values | {"change_errors": errors})
+    return replace(model, change_errors=errors)
 
 
 class _Columns:
@@ -290,7 +289,8 @@ class _Columns:
 
         Those to forces beside the location are added as far as they differ from these.
         """
-        number = 1 + len(self.structure.support_motions) + self._number_of(place)
+        names = [candidate.name for candidate in self.mass_places]
+        number = self._first_mass + names.index(place.name)
         self._add_remainders(number, self._unit_responses_to(place.rows))
         if place.reach > 0.0:
             rows = [place.rows_beside(*ends) for ends in place.reach * np.array(BESIDE)]
@@ -304,12 +304,8 @@ class _Columns:
         is_moved = lengths > SAME_DIRECTION * lengths.max()
         return np.asarray(block[:, is_moved] / lengths[is_moved])
 
-    def _number_of(self, place: MassCandidate) -> int:
-        """Return the index of a location where a mass may be."""
-        return [candidate.name for candidate in self.mass_places].index(place.name)
-
     def add_loss(self, patch: LossCandidate) -> None:
-        """Add the columns of a loss of stiffness: the changes that it makes of solutions and modes.
+        """Add the columns of a loss of stiffness: the changes of solutions and modes.
 
         They are the derivative for a small loss, and the differences for some large losses.
         """

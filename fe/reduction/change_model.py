@@ -1,7 +1,6 @@
 """The arrays of a model whose supports, masses and stiffness can be changed, on given columns."""
 
 from collections.abc import Sequence
-from dataclasses import fields
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -80,7 +79,7 @@ def model_on_columns(
     added_gauges, strain_rows = possible_gauges(structure)
     change_count = len(structure.support_motions) + len(changes.masses) + len(changes.losses)
     return ChangeableModel(
-        **{field.name: getattr(model, field.name) for field in fields(ReducedModel)},
+        **model.field_values(ReducedModel),
         whole_stiffness=_projected(terms.stiffness_terms, columns),
         whole_mass=_projected(structure.mass_terms, columns),
         whole_load=np.array(loads) @ columns,

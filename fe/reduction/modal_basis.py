@@ -158,8 +158,8 @@ def _refine_states(
         working.add(corrections[:, is_large])
         states = [state for state, corrected in by_state if corrected]
     raise ReductionError(
-        f"The modes of a sampled state reached a residual of {largest_residual:.2g} only in "
-        f"{MOST_CORRECTIONS} corrections, but {RESIDUAL_TOLERANCE:g} is needed."
+        f"After {MOST_CORRECTIONS} corrections the modes of a sampled state have a residual of "
+        f"{largest_residual:.2g}, but {RESIDUAL_TOLERANCE:g} is needed."
     )
 
 

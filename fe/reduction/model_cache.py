@@ -12,9 +12,9 @@ mesh by the static basis, which takes milliseconds.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, TypeVar, overload
+from typing import TYPE_CHECKING, Annotated, TypeVar, overload
 
 import numpy as np
 from threadpoolctl import threadpool_limits
@@ -113,12 +113,7 @@ class WingFields(ReducedModel):
     @property
     def model(self) -> ReducedModel:
         """The reduced model without the fields on the mesh."""
-        return ReducedModel(**_fields_of(self))
-
-
-def _fields_of(model: ReducedModel) -> dict[str, Any]:
-    """Return the fields of a reduced model by their names."""
-    return {field.name: getattr(model, field.name) for field in fields(ReducedModel)}
+        return ReducedModel(**self.field_values(ReducedModel))
 
 
 @overload
@@ -331,7 +326,7 @@ def field_basis(operators: "AffineOperators", reduction: "Reduction") -> WingFie
     ]
 
     return WingFields(
-        **_fields_of(reduction.model),
+        **reduction.model.field_values(),
         points=mesh.points,
         cells=mesh.cells,
         region=mesh.region,

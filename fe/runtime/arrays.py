@@ -191,7 +191,7 @@ class StoredArrays:
             )
 
     def __repr__(self) -> str:
-        values = {field.name: getattr(self, field.name) for field in fields(self)}
+        values = self.field_values()
         plain_values = [
             f"{name}={value!r}"
             for name, value in values.items()
@@ -204,6 +204,10 @@ class StoredArrays:
         name = f"{self.record_name[0].upper()}{self.record_name[1:]}"
         return ReducedModelFileError(f"{name} {fault}; build it again.")
 
+    def field_values(self, record: "type[StoredArrays] | None" = None) -> dict[str, Any]:
+        """Return the values of the fields by name: of all, or of those that a base class has."""
+        return {field.name: getattr(self, field.name) for field in fields(record or self)}
+
     def losses(self, stiffness_loss: LossValues) -> Losses:
         """Return one stiffness loss for each region; see `fe.runtime.state.losses_of`."""
         return losses_of(stiffness_loss, self.regions)
@@ -215,12 +219,11 @@ class StoredArrays:
     def to_bytes(self) -> bytes:
         """Return the bytes of an `.npz` file; equal records give equal bytes."""
         arrays: dict[str, AnyArray] = {"format": np.array(self.version)}
-        for field in fields(self):
-            value = getattr(self, field.name)
+        for name, value in self.field_values().items():
             if isinstance(value, tuple):
-                arrays[field.name] = np.array(value, dtype=np.str_)  # also of no names at all
+                arrays[name] = np.array(value, dtype=np.str_)  # also of no names at all
             else:
-                arrays[field.name] = np.array(value)
+                arrays[name] = np.array(value)
         return arrays_to_bytes(arrays)
 
     @classmethod
@@ -281,7 +284,7 @@ def _value_from_array(field: Field[object], arrays: Mapping[str, AnyArray]) -> A
 def _names_from_array(array: AnyArray) -> tuple[str, ...]:
     """Return the names in an array of text; raise `ValueError` for any other array."""
     if array.dtype.kind != "U" or array.ndim != 1:
-        raise ValueError(f"names are wanted, not {array.dtype} of shape {array.shape}")
+        raise ValueError(f"names are expected, not {array.dtype} of shape {array.shape}")
     return tuple(array.tolist())
 
 

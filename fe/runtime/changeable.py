@@ -104,8 +104,8 @@ class ChangeableModel(ReducedModel):
     mass_axes : (C, 2, 3) array
         Unit vectors of the distances from each place.
     mass_reaches : (C,) array
-        Distance from each place within which a mass is nearest to it [m], zero if it can lie there
-        alone.
+        How far a node can lie from the nearest place [m]; zero for a place beside which no mass can
+        lie.
     loss_places : tuple of str
         Names of the R patches that may lose stiffness, the last changes.
     loss_patch, loss_term : (Q,) array of int64
@@ -308,8 +308,8 @@ class ChangeableModel(ReducedModel):
         largest = FITTED_REACH * reach
         if max(abs(mass.along), abs(mass.across)) > largest:
             raise InvalidPatchError(
-                f"A mass lies {mass.along:g} m along and {mass.across:g} m across of "
-                f"{mass.place!r}, where both distances must be {largest:.3g} m at most: take a "
+                f"A mass lies {mass.along:g} m along and {mass.across:g} m across from "
+                f"{mass.place!r}, but both distances must be at most {largest:.3g} m; take a "
                 "nearer place."
             )
 
@@ -374,7 +374,7 @@ class ChangeableModel(ReducedModel):
 
     def __getstate__(self) -> dict[str, object]:
         """Return the fields alone, as computed properties cannot be pickled."""
-        return {name: vars(self)[name] for name in self.__dataclass_fields__}
+        return self.field_values()
 
     @cached_property
     def released_columns(self) -> IntArray:

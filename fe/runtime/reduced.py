@@ -176,8 +176,8 @@ class ReducedModel(ReducedArrays):
             if not low <= value <= high:
                 raise OutsideModelError(
                     f"{name} must lie between {low:g} and {high:g}, the range of the reduced model "
-                    f"of {self.name}, but is {float(value)!r}; give a value inside, or reduce it "
-                    "for a wider range."
+                    f"of {self.name}, but is {float(value)!r}; give a value inside, or build the "
+                    "reduced model for a wider range."
                 )
 
     # ------------------------------------------------------------ coefficients of terms

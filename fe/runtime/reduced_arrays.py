@@ -155,7 +155,7 @@ class ReducedArrays(StoredArrays):
         self._check_factors("load_factors", self.load_factors, load_names)
         has_factor_of_last_term = bool(self.stiffness_factors[-1].any())
         if has_factor_of_last_term or len(self.control_units) != len(self.controls):
-            raise self._error("has terms or units that are not those of its names")
+            raise self._error("has terms or units that do not fit its names")
 
     def _check_factors(self, name: str, factors: IntArray, counts: tuple[int, int]) -> None:
         """Raise `ReducedModelFileError` if factors (k, 2) exceed the counts of their names."""

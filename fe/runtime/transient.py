@@ -24,7 +24,6 @@ from .unit_responses import UnitResponses
 
 if TYPE_CHECKING:
     from .motion_arrays import ModalMotion
-    from .port_laws import PortLaws
 
 
 INSTANT = 1e-6
@@ -397,8 +396,10 @@ class ModalIntegrator:
         """
         load = state.load
         memory = state.memory
-        if self._laws is not None and not _has_same_laws(self._laws, previous_integrator._laws):
-            memory = self._laws.unloaded_memory()
+        laws = self._laws
+        previous_laws = previous_integrator._laws
+        if laws is not None and (previous_laws is None or not laws.has_same_laws(previous_laws)):
+            memory = laws.unloaded_memory()
             if not state.moves:  # the equilibrium is reached from no load
                 load = np.zeros_like(load)
         if not state.moves:
@@ -411,8 +412,3 @@ class ModalIntegrator:
         velocity = previous_integrator.structure.mode_shapes @ state.velocity
         projection = self.structure.modal_projection
         return TransientState(projection @ displacement, projection @ velocity, load, memory)
-
-
-def _has_same_laws(laws: "PortLaws", other_laws: "PortLaws | None") -> bool:
-    """Return whether two structures have laws of the same kinds at the same ports."""
-    return other_laws is not None and laws.has_same_laws(other_laws)

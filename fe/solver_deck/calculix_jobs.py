@@ -10,17 +10,16 @@ from scipy import sparse
 
 from fe.runtime.arrays import FloatArray
 from fe.runtime.errors import CalculixError
-from fe.structure.abaqus import DataLine, KeywordBlock
+from fe.structure.abaqus import KeywordBlock
 from fe.structure.matrix_tables import Dof, read_matrix, read_unknowns
 from fe.verification.calculix_run import first_error, read_frequencies, read_tables, run_calculix
 
-from .linear_model import LinearModel, block_lines
+from .linear_model import LinearModel, block_lines, set_block
 from .loads import DeckLoad
 
 ALL_NODES = "UAVALL"
 """Name of the set of all nodes, whose displacements are printed."""
 _STORE_MATRICES = ("*FREQUENCY, SOLVER=MATRIXSTORAGE",)
-_MEMBERS_IN_LINE = 10
 
 
 @dataclass(frozen=True)
@@ -152,10 +151,7 @@ class CalculixJobs:
         numbers = sorted(
             {node for element in self.model.mesh.elements.values() for node in element.nodes}
         )
-        starts = range(0, len(numbers), _MEMBERS_IN_LINE)
-        rows = [numbers[start : start + _MEMBERS_IN_LINE] for start in starts]
-        data = [DataLine("", [str(number) for number in row]) for row in rows]
-        return KeywordBlock("", "NSET", {"NSET": ALL_NODES}, data)
+        return set_block("NSET", ALL_NODES, numbers)
 
     def _run(self, name: str, text: str) -> str:
         """Run CalculiX on a deck's text and return its table of results.

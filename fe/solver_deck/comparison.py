@@ -161,9 +161,9 @@ def refuse_deviations(deck: Path, report: DeckReport, tolerance: float) -> None:
     """Raise `CalculixError` if the structure deviates from CalculiX, or nothing was compared."""
     if not report.load_deviations and not len(report.frequencies):
         raise CalculixError(
-            f"{deck}: a structure of {report.unknowns} unknowns has too few for frequencies that "
-            "could be compared with CalculiX, and no load of the deck was read; add a *STEP with "
-            "*STATIC and a *CLOAD."
+            f"{deck}: nothing can be compared with CalculiX: {report.unknowns} unknowns are too "
+            "few for frequencies, and no load of the deck was read; add a *STEP with *STATIC and a "
+            "*CLOAD."
         )
     deviations = {
         f"displacements under {name}": value for name, value in report.load_deviations.items()

@@ -279,7 +279,7 @@ def _choose_loads(
             loads.append(load)
     vectors = _gravity_forces(jobs, blocks, loads, matrices)
     for load in loads:
-        if load.name not in vectors and not load_rows.names_all(load):
+        if load.name not in vectors and not load_rows.has_only_nodal_forces(load):
             vectors[load.name] = load_rows.vector(load)
     return _ChosenLoads(loads, vectors, remarks)
 

@@ -25,6 +25,7 @@ PreloadChoice = Literal["tangent", "none"]
 
 _LONGEST_NUMBER = 20
 """Number of characters of a number that CalculiX reads; it silently cuts off the others."""
+_MEMBERS_IN_LINE = 10
 
 TRANSLATIONS = (1, 2, 3)
 ROTATIONS = (4, 5, 6)
@@ -230,6 +231,15 @@ def block_lines(block: KeywordBlock) -> list[str]:
     for name, value in block.parameters.items():
         head += f", {name}={value}" if value else f", {name}"
     return [head, *(",".join(values) for _, values in block.data)]
+
+
+def set_block(keyword: str, name: str, members: Sequence[int], where: str = "") -> KeywordBlock:
+    """Return an *NSET or *ELSET with these members; `where` is its place in the deck."""
+    lines = []
+    for start in range(0, len(members), _MEMBERS_IN_LINE):
+        texts = [str(number) for number in members[start : start + _MEMBERS_IN_LINE]]
+        lines.append(DataLine(where, texts))
+    return KeywordBlock(where, keyword, {keyword: name}, lines)
 
 
 def read_linear_model(

@@ -9,7 +9,7 @@ from fe.structure.abaqus import DataLine, KeywordBlock
 from fe.structure.deck_text import real
 from reporting.words import comma_list
 
-from .linear_model import LinearModel, real_text
+from .linear_model import LinearModel, real_text, set_block
 
 _PROPERTIES = {
     "CONDUCTIVITY",
@@ -51,7 +51,6 @@ CalculiX looks for eigenvalues near 1 (rad/s)^2 and misses smaller ones. A small
 eigenvalues large.
 """
 _NUMBERS_IN_LINE = 8
-_MEMBERS_IN_LINE = 10
 
 
 class Region(NamedTuple):
@@ -147,7 +146,7 @@ def with_scaled_modulus(
 
 
 def with_densities(model: LinearModel, blocks: Sequence[KeywordBlock]) -> list[KeywordBlock]:
-    """Return blocks in which each elastic material has a density, which CalculiX needs.
+    """Return blocks in which each material has a density, which CalculiX needs.
 
     If the deck has no density at all, it is `COMPARED_DENSITY`; else it is negligible.
     """
@@ -225,8 +224,8 @@ def _with_material_of_region(
         members_outside = [number for number in members if number not in region.elements]
         if members_outside:
             set_name = block.parameters["ELSET"].upper()
-            result += [_element_set(block, f"{set_name}_IN{suffix}", members_inside)]
-            result += [_element_set(block, f"{set_name}_EX{suffix}", members_outside)]
+            result += [set_block("ELSET", f"{set_name}_IN{suffix}", members_inside, block.where)]
+            result += [set_block("ELSET", f"{set_name}_EX{suffix}", members_outside, block.where)]
             inside_block = _with_set(inside_block, f"{set_name}_IN{suffix}")
             result.append(_with_set(block, f"{set_name}_EX{suffix}"))
         result.append(inside_block)
@@ -265,15 +264,6 @@ def _with_materials(section: KeywordBlock, suffix: str) -> KeywordBlock:
 def _with_set(section: KeywordBlock, set_name: str) -> KeywordBlock:
     """Return a section with another set of elements."""
     return section._replace(parameters=section.parameters | {"ELSET": set_name})
-
-
-def _element_set(section: KeywordBlock, name: str, members: Sequence[int]) -> KeywordBlock:
-    """Return an *ELSET with these members."""
-    lines = []
-    for start in range(0, len(members), _MEMBERS_IN_LINE):
-        texts = [str(number) for number in members[start : start + _MEMBERS_IN_LINE]]
-        lines.append(DataLine(section.where, texts))
-    return KeywordBlock(section.where, "ELSET", {"ELSET": name}, lines)
 
 
 def _with_scaled_constants(block: KeywordBlock, factor: float) -> KeywordBlock:

@@ -110,8 +110,8 @@ class MotionRows:
             return self.bound[dof]
         return self._reader.weighted(dof, READ_WEIGHTS)
 
-    def names_all(self, load: DeckLoad) -> bool:
-        """Return whether nodes and directions alone describe a load's forces."""
+    def has_only_nodal_forces(self, load: DeckLoad) -> bool:
+        """Return whether a load consists of forces at nodes that have rows or are held."""
         has_others = bool(load.moments) or any(
             any(forces.values()) for forces in load.side_forces.values()
         )

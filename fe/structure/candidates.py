@@ -77,7 +77,7 @@ class MassCandidate(NamedTuple):
     point : (3,) array
         The location, or the centre of a set; zero for matrices, which have no places [m].
     reach : float
-        Distance from the point within which another location is nearer to no other point [m]; zero
+        How far a node of the structure can lie from the nearest of the points on the grid [m]; zero
         if the mass can lie at the location alone.
     axes : (2, 3) array
         Unit vectors along which the mass may lie beside the point: directions in which the
@@ -122,9 +122,9 @@ class LossCandidate(NamedTuple):
 def mass_places(structure: AffineStructure) -> list[MassCandidate]:
     """List the locations where a mass may be added or missing.
 
-    In a mesh they are its named sets of nodes, whose mean displacement the mass then follows, and
-    the points of a coarse grid. In a structure of matrices they are the nodes that its file names.
-    Locations that the supports hold are left out.
+    In a mesh they are its named sets of less than half of the nodes, whose mean displacement the
+    mass then follows, and the points of a coarse grid. In a structure of matrices they are the
+    nodes that its file names. Locations that the supports hold are left out.
     """
     if isinstance(structure, Structure):
         candidates = list(places_of_mesh(structure.mesh))
@@ -184,7 +184,8 @@ class MassPlace(NamedTuple):
 def places_of_mesh(mesh: StructureMesh) -> Iterator[MassPlace]:
     """Yield the places of a mesh at which a point mass may be added.
 
-    These are first the named sets of nodes, then nodes that are spread evenly over the mesh. A mass
+    These are first the named sets of less than half of the nodes, without those that the mesher
+    makes, then nodes that are spread evenly over the mesh. A mass
     at one of the latter may also lie beside the node, up to the `reach` of the place: there its
     weights follow from their slopes.
     """

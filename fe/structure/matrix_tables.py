@@ -93,7 +93,8 @@ def read_matrix(folder: Path, name: str) -> tuple[sparse.csr_array, list[Dof] | 
         return _square_matrix(path, content.array), None
     table = content.array
     width = table.shape[1]
-    if width not in (3, 5) or not table.size or not _are_whole(table[:, :-1]):
+    are_positions_whole = np.array_equal(table[:, :-1], np.rint(table[:, :-1]))
+    if width not in (3, 5) or not table.size or not are_positions_whole:
         fail(
             str(path),
             "lines of row, column and value, or of node, component, node, component and value, "
@@ -111,10 +112,6 @@ def read_matrix(folder: Path, name: str) -> tuple[sparse.csr_array, list[Dof] | 
             fail(str(path), "rows and columns are counted from 1, but there is a smaller one.")
         indices = positions - 1
     return _symmetric_matrix(indices, table[:, -1]), unknowns
-
-
-def _are_whole(numbers: FloatArray) -> bool:
-    return np.array_equal(numbers, np.rint(numbers))
 
 
 def _square_matrix(path: Path, matrix: FloatArray | sparse.sparray) -> sparse.csr_array:

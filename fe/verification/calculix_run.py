@@ -60,8 +60,8 @@ def read_tables(text: str) -> dict[str, list[FloatArray]]:
             rows = np.loadtxt(body.splitlines(), ndmin=2)
         except ValueError as error:
             raise CalculixError(
-                f"The table of {quantity} that CalculiX printed holds what is not a row of numbers "
-                f"({error}); its version may print another format (2.20 is known)."
+                f"The table of {quantity} that CalculiX printed has a line that is not a row of "
+                f"numbers ({error}); another version than 2.20 may print another format."
             ) from None
         tables.setdefault(set_name, []).append(rows)
     return tables

@@ -40,9 +40,9 @@ def draft_binding(description: FmuDescription, *, step_size: float | None = None
     """Return a binding file for an FMU, to be corrected by somebody who knows its model.
 
     Inputs are controls, unless their name or unit indicates health or load. Real outputs are
-    observations, numbered ones together; other outputs are recorded in addition. A force input with
-    a displacement or velocity output of the same stem becomes a port. The text is checked against
-    the FMU before it is returned.
+    observations, numbered ones together; those whose names look auxiliary, and outputs of other
+    types, are recorded in addition. A force with a displacement or velocity of the same stem on the
+    other side of the FMU becomes a port. The text is checked against the FMU before it is returned.
 
     Parameters
     ----------
@@ -107,7 +107,7 @@ def bindable(variable: VariableInfo) -> bool:
 
 
 def observable(description: FmuDescription, usable: Sequence[VariableInfo]) -> list[VariableInfo]:
-    """Return the outputs among usable variables; if there are none, the first local number.
+    """Return the outputs among usable variables; if there are none, the first internal number.
 
     Raises
     ------

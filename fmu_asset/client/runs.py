@@ -222,7 +222,7 @@ class FmuRuns:
             for point, point_offsets in zip(points, offsets_by_point, strict=True):
                 inputs_of_points.append(self._constant_inputs(point, point_offsets))
             inputs = {
-                name: np.array([point_number[name] for point_number in inputs_of_points])
+                name: np.array([point_inputs[name] for point_inputs in inputs_of_points])
                 for name in inputs_of_points[0]
             }
             asset = self._reset_instance(points[0], step, offsets_by_point[0])

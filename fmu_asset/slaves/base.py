@@ -140,7 +140,7 @@ class Slave:
         Returns
         -------
         bool
-            Whether the step was made. If not (fmi2Discard), nothing has changed.
+            Whether the step was made. If not (fmi2Discard), only the output `status` has changed.
         """
         if not self._may_step(current_time, step_size):
             return False
@@ -233,8 +233,8 @@ class Slave:
     def _set(self, kind: str, vrs: Sequence[int], values: Sequence[float]) -> None:
         """Set variables by their value references, in a call for a base type.
 
-        Inputs and tunable parameters can be set at any time, other parameters before the
-        initialisation only.
+        Inputs and tunable parameters can be set at any time, other parameters until the
+        initialisation has succeeded.
         """
         for vr, value in zip(vrs, values, strict=True):
             row = self._table[vr] if 0 <= vr < len(self._table) else None
@@ -257,7 +257,7 @@ class Slave:
     set_boolean = partialmethod(_set, "Boolean")
 
     def get_real(self, vrs: Sequence[int]) -> list[float]:
-        """Return values of variables; pending outputs among them are computed now."""
+        """Return values of variables; outputs that were not computed yet are computed now."""
         values = self._values
         if min(vrs, default=0) < 0 or max(vrs, default=0) >= len(values):
             unknown = next(vr for vr in vrs if not 0 <= vr < len(values))

@@ -288,7 +288,7 @@ def test_compliances_of_one_motion_add_up(flanged: Yielding) -> None:
         (RegionStiffnessLoss("nose", 0.5), "no place 'nose' for a loss"),
         (RegionStiffnessLoss("around", 1.0), "'around' must be at least 0 and below 1, but is 1"),
         (RegionStiffnessLoss("around", 0.5, extent=0.0), "of 'around' must be positive, but is 0"),
-        (PlaceMass("end", 1.0, along=0.02), "0.02 m along .* 'end', .* must be 0 m at most"),
+        (PlaceMass("end", 1.0, along=0.02), "0.02 m along .* 'end', .* must be at most 0 m"),
     ],
 )
 def test_what_cannot_change_is_refused(
