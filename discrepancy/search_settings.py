@@ -155,6 +155,9 @@ class SearchSettings:
     weighed_range: float = 60.0
     """Sets whose expected score is farther below the best one are not fitted: such a fit changes it
     by less."""
+    proving_share: float = 0.75
+    """Fraction of the missing force, by the lower end of its interval, and of the mean square error
+    of held-out trials that a force of free shape must explain to be proved by them."""
     least_gap_share: float = 0.5
     """Fraction of the gap that the interval of a partly named set must reach.
 

@@ -37,6 +37,7 @@ from discrepancy.judgement.remarks import (
     KINDS_WITH_NAME,
     KINDS_WITHOUT_GAP,
     look_alike_remark,
+    verdict_with_only_sensor,
     verdict_with_times,
     verdict_with_untested_effects,
 )
@@ -186,6 +187,7 @@ def investigate(
             problem, catalogue, on_progress=show_message, on_search=on_search
         )
         verdict = verdict_with_untested_effects(verdict, problem.setting, catalogue)
+        verdict = verdict_with_only_sensor(verdict, campaign)
     remarks += _remarks(problem, catalogue, verdict, search, fit)
     with stages.stage("Checking the time steps", "steps"):
         remarks += _remarks_on_time_steps(problem, fit)

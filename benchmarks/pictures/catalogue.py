@@ -190,7 +190,7 @@ PICTURES = {
             (
                 Statement(
                     "docs/explanation/measured_rigs.md",
-                    "begins at {level} ({low} to {high}) of the largest excess temperature",
+                    "to {flow} °C/s at an excess of {excess} °C",
                 ),
             ),
             record="CoolingWater.csv",

@@ -11,10 +11,12 @@ from benchmarks.pictures.picture import Drawing
 from benchmarks.public_rigs.__main__ import write as write_public_rig
 from discrepancy.campaign.records import Trial
 from discrepancy.fits.problem import Problem
+from discrepancy.judgement.curve_words import curve_of
 from discrepancy.report.force_figure import missing_force_figure
 from discrepancy.sources.measured_rigs import write_rig_campaign
 from discrepancy.workflow import Investigation
 from evidence.sandwich_plate.plate_comparison import DAMAGE, PlateAgreement, compare_with_plate
+from fe.runtime.patch import TableDamping
 from fe.wing.design import load_design
 from reporting.pages.figures import (
     OBSERVED,
@@ -107,9 +109,9 @@ def draw_cooling_water(data: Path) -> Drawing:
     """Draw the heat flow that Newton's law of cooling lacks for a mug of water."""
     folder = write_public_rig("cooling_water", data.parent, folder_until_exit() / "cooling_water")
     investigation = uav_twin.investigate(folder, folder / "model.toml")
-    (effect,) = investigation.verdict.effects
-    (level,) = (estimate for estimate in effect.parameters if estimate.name == "level_ratio")
-    numbers = {"level": float(level.value), "low": float(level.low), "high": float(level.high)}
+    curve = curve_of(investigation.verdict.effects)
+    assert isinstance(curve, TableDamping), "a law at a port of a state takes it for a speed"
+    numbers = {"flow": float(curve.forces[-1]), "excess": float(curve.speeds[-1])}
     return Drawing(force_drawing(investigation), numbers)
 
 

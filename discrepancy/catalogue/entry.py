@@ -236,17 +236,19 @@ class EffectKeys:
 class ForceTable:
     """A force over the displacement or velocity of a port: functions with free amplitudes.
 
+    At a port of a state it is a flow over the value of the state, such as a level.
+
     Attributes
     ----------
-    variable : {"displacement", "velocity"}
+    variable : {"displacement", "velocity", "state"}
         What the force follows.
     points : (P,) ndarray
-        The displacements or velocities, rising [m or rad, or per s].
+        The displacements or velocities, rising [m or rad, or per s]; or the values of the state.
     functions : (P, K) ndarray
-        The force at each point for a unit of each of the K amplitudes [N or N m].
+        The force at each point for a unit of each of the K amplitudes [N or N m], or the flow.
     """
 
-    variable: Literal["displacement", "velocity"]
+    variable: Literal["displacement", "velocity", "state"]
     points: FloatArray
     functions: FloatArray
 

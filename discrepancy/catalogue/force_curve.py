@@ -1,5 +1,7 @@
 """A force of free shape at a port: a curve over the displacement or the velocity.
 
+At a port of a state, such as a level or a temperature, it is a flow: a curve over the state.
+
 The prior of the curve is a Gaussian process (Rasmussen and Williams 2006, *Gaussian Processes for
 Machine Learning*, chapter 2). It is written as a sum of functions with independent amplitudes (the
 Karhunen-Loeve expansion), so that the curve is an effect with ordinary parameters.
@@ -21,10 +23,15 @@ from discrepancy.catalogue.entry import (
     Prior,
     Setting,
 )
+from fe.runtime.laws.interface import PortForce
 from fe.runtime.patch import ModelPatch, TableDamping, TableStiffness
 
-IDENTIFIERS = {"displacement": "force_over_displacement", "velocity": "force_over_velocity"}
-"""Identifier of a force of free shape, by what it follows."""
+IDENTIFIERS = {
+    "displacement": "force_over_displacement",
+    "velocity": "force_over_velocity",
+    "state": "flow_over_state",
+}
+"""Identifier of a force or flow of free shape, by what it follows."""
 POINT_COUNT = 49
 """Number of points of the table of a curve."""
 CORRELATION_LENGTHS = (0.12, 0.06)
@@ -36,9 +43,31 @@ are spaced by its logarithm, since friction changes most near zero."""
 NEGLECTED_VARIANCE = 1e-4
 """Share of the prior variance that the neglected functions would have."""
 
-Variable = Literal["displacement", "velocity"]
-VARIABLES: tuple[Variable, ...] = ("displacement", "velocity")
+Variable = Literal["displacement", "velocity", "state"]
 """What a curve may run over."""
+
+
+def curve_family(variable: Variable) -> str:
+    """Return the family of all forces that follow a variable, such as "force over the velocity"."""
+    kind = "flow" if variable == "state" else "force"
+    return f"{kind} over the {variable}"
+
+
+def curve_families_of(setting: Setting, patch: ModelPatch) -> set[tuple[str, str]]:
+    """Return the families of free shape that the laws of a patch belong to, with their ports.
+
+    A law with memory belongs to none.
+    """
+    families = set()
+    for law in patch:
+        if not isinstance(law, PortForce) or law.hysteretic:
+            continue
+        scale = setting.scales.ports.get(law.port)
+        variable: Variable = "velocity" if law.depends_on_speed else "displacement"
+        if scale is not None and scale.of_state:
+            variable = "state"
+        families.add((curve_family(variable), law.port))
+    return families
 
 
 @cache
@@ -67,10 +96,10 @@ def curve_functions(correlation_length: float) -> FloatArray:
 def curve_points(variable: Variable, low: float, high: float) -> FloatArray:
     """Return the points (P,) of a curve between two ends.
 
-    The points are evenly spaced for displacements, and dense around zero for velocities; see
-    `DENSE_VELOCITY`.
+    The points are evenly spaced for displacements and states, and dense around zero for velocities;
+    see `DENSE_VELOCITY`.
     """
-    if variable == "displacement":
+    if variable != "velocity":
         return np.linspace(low, high, POINT_COUNT)
     dense_velocity = DENSE_VELOCITY * max(abs(low), abs(high))
     first = np.arcsinh(low / dense_velocity)
@@ -85,7 +114,7 @@ def variance_along_curve(variable: Variable, values: FloatArray, force: FloatArr
 
     Parameters
     ----------
-    variable : {"displacement", "velocity"}
+    variable : {"displacement", "velocity", "state"}
         What the curve runs over.
     values, force : (N,) array
         The variable and the force at the same times.
@@ -114,12 +143,13 @@ def force_curve(
     ----------
     port : str
         Name of the port.
-    variable : {"displacement", "velocity"}
+    variable : {"displacement", "velocity", "state"}
         What the curve runs over.
     ends : tuple of float
-        Least and largest displacement or velocity in the trials [m or rad, or per s].
+        Least and largest displacement or velocity in the trials [m or rad, or per s], or values of
+        the state.
     force_deviation : float
-        Prior standard deviation of the force at each point [N or N m].
+        Prior standard deviation of the force at each point [N or N m], or of the flow.
     correlation_length : float
         Correlation length of the curve, as a fraction of the range.
     """
@@ -128,7 +158,10 @@ def force_curve(
         points=curve_points(variable, *ends),
         functions=force_deviation * curve_functions(correlation_length),
     )
+    # a law at a port of a state takes the state for a speed
     law = TableStiffness if variable == "displacement" else TableDamping
+    family = curve_family(variable)
+    kind = family.split()[0]
     # a physical value of one is one prior standard deviation
     amplitude_prior = Prior("normal", -NINETY_PERCENT_QUANTILE, NINETY_PERCENT_QUANTILE)
     parameters = []
@@ -151,10 +184,10 @@ def force_curve(
 
     return Effect(
         identifier=IDENTIFIERS[variable],
-        name=f"force of free shape over the {variable}",
-        family=f"force over the {variable}",
+        name=f"{kind} of free shape over the {variable}",
+        family=family,
         equation=f"F = F({variable}), a curve through estimated points",
-        signature=f"The missing force is a function of the {variable}.",
+        signature=f"The missing {kind} is a function of the {variable}.",
         reference="Rasmussen and Williams 2006, Gaussian Processes for Machine Learning, chapter 2",
         acts_on=frozenset(TrialKind) if variable == "displacement" else DYNAMIC,
         parameters=tuple(parameters),

@@ -15,7 +15,7 @@ from discrepancy.campaign.records import FloatArray
 from discrepancy.catalogue.entry import Effect
 from discrepancy.catalogue.force_curve import (
     CORRELATION_LENGTHS,
-    VARIABLES,
+    Variable,
     force_curve,
     variance_along_curve,
 )
@@ -90,7 +90,8 @@ def rank_hypotheses(
 
     Effects are added to the best hypothesis one at a time, as long as its score rises. Each time,
     simpler forms of the best hypothesis are estimated, too. A force of free shape is estimated
-    after the first effect. The ranking ends there if that is more probable and leaves no force.
+    after the first effect, also if none is more probable than no effect. The ranking ends there if
+    the force of free shape is more probable and leaves no force.
 
     Parameters
     ----------
@@ -106,18 +107,17 @@ def rank_hypotheses(
         rough_estimates = ranking.rough_estimates(best_estimate, rough_count)
         ranking.estimate_in_full(best_estimate, rough_estimates, beam_width)
         ranking.estimate_simpler_forms()
-        if ranking.best is best_estimate:
-            break
         is_first_effect = not best_estimate.candidate.terms
+        is_improved = ranking.best is not best_estimate
         best_estimate = ranking.best
-        if is_first_effect:
-            curve = ranking.estimate_curve()
-            if (
-                curve is not None
-                and curve.leaves_no_force
-                and ranking.score(curve) > ranking.score(best_estimate)
-            ):
-                break
+        curve = ranking.estimate_curve() if is_first_effect else None
+        is_curve_enough = (
+            curve is not None
+            and curve.leaves_no_force
+            and ranking.score(curve) > ranking.score(best_estimate)
+        )
+        if is_curve_enough or not is_improved:
+            break
     return ranking.in_order()
 
 
@@ -281,9 +281,10 @@ class _Ranking:
 
         A named law is enough if it leaves no force, and no exponent of it had to be fitted. The
         curve acts at the port where most force is missing, and is a function of displacement or
-        velocity, whichever explains more of that force. A port of a state has neither. Curves with
-        ever sharper bends are tried, until one leaves no force or is less probable than the best
-        named law. Of those that leave no force, or else of all, the most probable one is kept.
+        velocity, whichever explains more of that force; a flow at a port of a state is one of the
+        state. Curves with ever sharper bends are tried, until one leaves no force or is less
+        probable than the best named law. Of those that leave no force, or else of all, the most
+        probable one is kept.
         """
         if self.best.leaves_no_force and not self.best.candidate.has_free_shape:
             return None
@@ -291,18 +292,11 @@ class _Ranking:
         port = max(base.processes, key=self.search.force_deviation)
         ported = self.search.ported
         port_name = ported.ports[port]
-        scale = ported.problem.setting.scales.ports.get(port_name)
-        if scale is not None and scale.of_state:
-            return None
         force = np.concatenate([trial.missing_forces[port] for trial in base.trials])
-        motion = {
-            "displacement": np.concatenate(
-                [trial.trajectory.positions[:, port] for trial in base.trials]
-            ),
-            "velocity": np.concatenate([trial.trajectory.speeds[:, port] for trial in base.trials]),
-        }
+        scale = ported.problem.setting.scales.ports.get(port_name)
+        motion = _motion_of_port(base, port, is_state=scale is not None and scale.of_state)
         # at rest the velocity is zero
-        variables = [name for name in VARIABLES if np.any(motion[name])]
+        variables = [name for name, values in motion.items() if np.any(values)]
         variable = max(variables, key=lambda name: variance_along_curve(name, motion[name], force))
         values = motion[variable]
         estimates = []
@@ -343,6 +337,19 @@ class _Ranking:
             ):
                 forms.append(_ValuedCandidate(other, estimate.effect))
         return forms
+
+
+def _motion_of_port(base: Estimate, port: int, *, is_state: bool) -> dict[Variable, FloatArray]:
+    """Return what a force at a port may follow, in all trials one after the other.
+
+    It is the displacement and the velocity. At a port of a state it is the state, whose value
+    stands in the place of a speed.
+    """
+    speeds = np.concatenate([trial.trajectory.speeds[:, port] for trial in base.trials])
+    if is_state:
+        return {"state": speeds}
+    positions = np.concatenate([trial.trajectory.positions[:, port] for trial in base.trials])
+    return {"displacement": positions, "velocity": speeds}
 
 
 def _families_at_places(candidate: Candidate) -> list[tuple[str, str]]:

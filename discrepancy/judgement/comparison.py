@@ -17,6 +17,7 @@ from scipy.special import logsumexp
 from scipy.stats import chi2
 
 from discrepancy.campaign.records import FloatArray
+from discrepancy.catalogue.force_curve import curve_families_of
 from discrepancy.fits.candidate import Candidate, CandidateKey, EffectTerm
 from discrepancy.fits.fitting import CandidateFit
 from discrepancy.fits.gates import ABSOLUTE_FIT_LEVEL, check_absolute_fit
@@ -231,6 +232,40 @@ class Comparison(ABC, Generic[HypothesisT]):
             return True
         return self.errors(hypothesis).has_grown
 
+    def reason_of_remaining_error(self, hypothesis: HypothesisT) -> str:
+        """Return the reason if most of the error of held-out trials remains with a hypothesis.
+
+        It is empty if at least `SEARCH.least_gap_share` of their mean square error is removed, and
+        if nothing is held out.
+        """
+        closed = self.errors(hypothesis).closed
+        if closed is None or closed.trials != "held-out" or closed.value >= SEARCH.least_gap_share:
+            return ""
+        return (
+            "a name must remove at least "
+            f"{100 * SEARCH.least_gap_share:g} % of the mean square error there"
+        )
+
+    def is_proved_curve(self, hypothesis: HypothesisT) -> bool:
+        """Return whether held-out trials prove a force of free shape.
+
+        Fitted to other trials, it explains at least `SEARCH.proving_share` of their missing force
+        and of their mean square error. A missing force without any law has a course of its own in
+        each trial: before a trial was measured it explains nothing of it.
+        """
+        terms = hypothesis.candidate.terms
+        if not self.has_held_out or len(terms) != 1 or terms[0].effect.table is None:
+            return False
+        share = self.gap_share(hypothesis, held_out=True)
+        closed = self.errors(hypothesis).closed
+        return bool(
+            share.is_tested
+            and share.interval[0] >= SEARCH.proving_share
+            and closed is not None
+            and closed.trials == "held-out"
+            and closed.value >= SEARCH.proving_share
+        )
+
     # ---------------------------------------------------------------- which may be named
 
     def held_out_or_fitted_share(self, hypothesis: HypothesisT) -> GapShare:
@@ -416,34 +451,67 @@ class Comparison(ABC, Generic[HypothesisT]):
         """Return the probability that at least one of the given hypotheses is true.
 
         - A ranked hypothesis counts for a given one if it contains all families of the given one at
-          the same places, possibly beside further effects.
+          the same places, possibly beside further effects. It counts for a force of free shape if a
+          law of it follows the same variable at the same port: two laws of one variable are a curve
+          over it, too.
         - A ranked hypothesis that trials refute has no probability. Two kinds are kept in any case:
           the given ones, whose probability is asked for, and those without effects, which by
-          definition explain nothing of the gap.
+          definition explain nothing of the gap. The latter are dropped beside a force of free shape
+          that held-out trials prove.
         """
+        is_proved = any(self.is_proved_curve(hypothesis) for hypothesis in hypotheses)
         not_refuted = []
         for ranked_hypothesis in self.ranked_hypotheses:
             # the same object: another fit of the same effects is another hypothesis
             is_asked_about = any(ranked_hypothesis is hypothesis for hypothesis in hypotheses)
             has_effects = bool(ranked_hypothesis.candidate.terms)
-            if (
-                is_asked_about
-                or not has_effects
-                or not self._is_refuted_by_trials(ranked_hypothesis)
-            ):
+            if has_effects:
+                is_kept = not self._is_refuted_by_trials(ranked_hypothesis)
+            else:
+                is_kept = not is_proved
+            if is_asked_about or is_kept:
                 not_refuted.append(ranked_hypothesis)
         scores = np.array([self.score(hypothesis) for hypothesis in not_refuted])
         # a hypothesis counts if it contains all families of one of those asked about
         families_asked_about = [family_place_pairs(hypothesis) for hypothesis in hypotheses]
         is_counted = np.zeros(len(not_refuted), dtype=bool)
         for index, hypothesis in enumerate(not_refuted):
-            families = family_place_pairs(hypothesis)
+            families = family_place_pairs(hypothesis) | self._curves_of_laws(hypothesis)
             is_counted[index] = any(
                 asked_families <= families for asked_families in families_asked_about
             )
         if not is_counted.any():
             return 0.0
         return probability_of_some(scores, is_counted)
+
+    def _curves_of_laws(self, hypothesis: HypothesisT) -> EffectPlacePairs:
+        """Return the families of free shape that the laws of a hypothesis belong to, with ports."""
+        setting = self.problem.setting
+        patch = hypothesis.candidate.patch(setting, hypothesis.effect)
+        return frozenset(curve_families_of(setting, patch))
+
+    def more_probable_rival(self, hypothesis: HypothesisT) -> HypothesisT | None:
+        """Return the most probable hypothesis with effects if it is not refuted by trials.
+
+        None if it is the given hypothesis or less probable than that.
+        """
+        for rival in self.ranked_hypotheses:
+            if rival is hypothesis:
+                break
+            if rival.candidate.terms and not self._is_refuted_by_trials(rival):
+                return rival
+        return None
+
+    def has_more_probable_law(self, curve: HypothesisT) -> bool:
+        """Return whether a single law of what a force of free shape follows is more probable."""
+        pairs = family_place_pairs(curve)
+        for hypothesis in self.ranked_hypotheses:
+            terms = hypothesis.candidate.terms
+            is_law = len(terms) == 1 and terms[0].effect.table is None
+            is_more_probable = self.score(hypothesis) > self.score(curve)
+            if is_law and is_more_probable and pairs & self._curves_of_laws(hypothesis):
+                return True
+        return False
 
     def _is_refuted_by_trials(self, hypothesis: HypothesisT) -> bool:
         """Return whether trials show that a hypothesis does not explain enough of the gap."""

@@ -1,6 +1,7 @@
 """The shape of a force over the motion in words, such as "no force up to 2 mm, then 480 N/m".
 
-A force counts positive against the motion, as that of a spring.
+A force counts positive against the motion, as that of a spring. At a port of a state the force is a
+flow over the state, which counts positive where it takes from the state.
 """
 
 from collections.abc import Sequence
@@ -9,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from discrepancy.campaign.records import BoolArray, FloatArray
+from discrepancy.catalogue.force_curve import IDENTIFIERS
 from discrepancy.verdict import NamedEffect
 from fe.runtime.patch import TableDamping, TableStiffness
 from reporting.words import listing, number
@@ -27,6 +29,11 @@ ONE_SIDED = 0.2
 """Largest force on one side over that on the other, up to which the force acts on one side only."""
 PEAK_OVER_END = 1.2
 """Friction near rest over that at the largest velocity, from which on it has a peak near rest."""
+OTHER_SIDE = 0.1
+"""Range of motion on one side of zero over that on the other, from which on both were seen."""
+LARGEST_MISFIT_OF_POWER = 0.25
+"""Share of the variance of a force about its value at rest that a power of the motion may leave. If
+it leaves more, the force is told at three points instead."""
 LEAST_POINTS_OF_FRICTION = 6
 """Least number of points in each direction that can show such a peak."""
 CONSTANT_EXPONENT, LINEAR_EXPONENT = 0.3, 1.2
@@ -41,9 +48,13 @@ def curve_of(effects: Sequence[NamedEffect]) -> TableStiffness | TableDamping | 
     return law if isinstance(law, TableStiffness | TableDamping) else None
 
 
-def followed_variable(curve: TableStiffness | TableDamping) -> str:
-    """Return what the force of a curve follows."""
-    return "displacement" if isinstance(curve, TableStiffness) else "velocity"
+def followed_variable_text(effect: NamedEffect) -> str:
+    """Return a force of free shape in words, such as "force that follows the velocity"."""
+    if effect.identifier == IDENTIFIERS["state"]:
+        return "flow that follows the state"
+    (law,) = effect.patch
+    variable = "displacement" if isinstance(law, TableStiffness) else "velocity"
+    return f"force that follows the {variable}"
 
 
 def curve_in_words(curve: TableStiffness | TableDamping, force_unit: str) -> str:
@@ -54,8 +65,13 @@ def curve_in_words(curve: TableStiffness | TableDamping, force_unit: str) -> str
     curve : TableStiffness or TableDamping
         The force at displacements or velocities of its port.
     force_unit : str
-        The unit of the force: N, N m or, where the port is not known, "N or N m".
+        The unit of the force: N, N m or, where the port is not known, "N or N m"; at a port of a
+        state, that of the flow, such as "degC/s times capacity".
     """
+    state_unit, is_flow, _ = force_unit.partition("/s times")
+    if is_flow and isinstance(curve, TableDamping):
+        flows = np.array(curve.forces)
+        return _at_three_points(np.array(curve.speeds), flows, force_unit, state_unit)
     motion_unit = {"N": "m", "N m": "rad"}.get(force_unit, "m or rad")
     forces = np.array(curve.forces)
     if isinstance(curve, TableDamping):
@@ -123,6 +139,17 @@ def _line_of_longest_stretch(displacements: FloatArray, forces: FloatArray) -> _
             if difference[stretch].max() <= STRAIGHT * difference.max():
                 return line
     return None
+
+
+def _at_three_points(
+    motion: FloatArray, forces: FloatArray, force_unit: str, motion_unit: str
+) -> str:
+    """Return the force at the first, the middle and the last point of its curve."""
+    indices = (0, len(motion) // 2, len(motion) - 1)
+    texts = [
+        f"{number(forces[index])} at {number(motion[index])} {motion_unit}" for index in indices
+    ]
+    return f"it is {listing(texts)} (in {force_unit})"
 
 
 def _position_text(position: float, unit: str) -> str:
@@ -197,21 +224,31 @@ def _growth(
 ) -> str:
     """Return in words how a force grows with the motion, how far, and whether on one side only.
 
-    `variable` says whether the motion is a displacement or a velocity.
+    `variable` says whether the motion is a displacement or a velocity. A force that is no power of
+    the motion is told at three points.
     """
     changes = forces - float(np.interp(0.0, motion, forces))
     largest_by_side = {}
     for side in (1.0, -1.0):
-        changes_on_side = np.where(side * motion > 0.0, changes, 0.0)
-        largest_by_side[side] = float(np.abs(changes_on_side).max())
+        is_on_side = side * motion > 0.0
+        largest_by_side[side] = float(np.max(np.abs(changes[is_on_side]), initial=0.0))
     stronger = max(largest_by_side, key=lambda side: largest_by_side[side])
-    is_one_sided = largest_by_side[-stronger] < ONE_SIDED * largest_by_side[stronger]
+    # a body that only falls shows nothing of the other side
+    range_of_other_side = float(np.max(-stronger * motion))
+    saw_other_side = range_of_other_side > OTHER_SIDE * float(np.max(stronger * motion))
+    is_weak_there = largest_by_side[-stronger] < ONE_SIDED * largest_by_side[stronger]
+    is_one_sided = saw_other_side and is_weak_there
     # the exponent of the force on the stronger side is a slope in logarithms
     on_side = (stronger * motion > 0.0) & (np.abs(changes) > 0.0)
     log_force = np.log(np.abs(changes[on_side]))
     log_motion = np.log(np.abs(motion[on_side]))
     weights = np.sqrt(np.abs(changes[on_side]))  # small forces tell little of the exponent
-    exponent = float(np.polyfit(log_motion, log_force, 1, w=weights)[0])
+    exponent, log_factor = np.polyfit(log_motion, log_force, 1, w=weights).tolist()
+    changes_on_side = changes[on_side]
+    power_on_side = np.exp(log_factor + exponent * log_motion)
+    misfit = changes_on_side - np.sign(changes_on_side.sum()) * power_on_side
+    if misfit @ misfit > LARGEST_MISFIT_OF_POWER * (changes_on_side @ changes_on_side):
+        return _at_three_points(motion, forces, force_unit, motion_unit)
     largest = int(np.argmax(np.where(on_side, np.abs(changes), 0.0)))
     acts_against = changes[largest] * motion[largest] > 0.0
     largest_force = f"{number(float(np.abs(changes[largest])))} {force_unit}"

@@ -30,7 +30,7 @@ from discrepancy.verdict import (
 from fe.runtime.patch import SensorGain
 from reporting.words import between, listing, rounded
 
-from .curve_words import curve_in_words, curve_of, followed_variable
+from .curve_words import curve_in_words, curve_of, followed_variable_text
 
 UNEXPLAINED_GAP = "Something is missing that no effect of the catalogue explains."
 """The conclusion on a gap of which neither a law nor a force is known."""
@@ -92,22 +92,33 @@ def outcome_with_hypotheses(
     return VerdictOutcome(complete_verdict, search, fit)
 
 
-def curve_sentence(problem: Problem, effects: Sequence[NamedEffect], probability: float) -> str:
+def curve_sentence(
+    problem: Problem,
+    effects: Sequence[NamedEffect],
+    probability: float,
+    *,
+    is_law_open: bool = False,
+) -> str:
     """Return the sentence on a force of free shape; empty if the effects are something else.
 
     Parameters
     ----------
     effects : sequence of NamedEffect
         The effects of a hypothesis at their most probable values.
+    is_law_open : bool
+        Whether a law of the catalogue may have the shape.
     """
     curve = curve_of(effects)
     if curve is None:
         return ""
     force_unit, _ = problem.model.port_units(curve.port)
+    laws = "no law of the catalogue has its shape"
+    if is_law_open:
+        laws = "these trials do not tell which law of the catalogue it is"
     return (
-        f"A force that follows the {followed_variable(curve)} is missing at {curve.port} "
-        f"(probability {probability_text(probability)}), and no law of the catalogue has its "
-        f"shape: {curve_in_words(curve, force_unit)}."
+        f"A {followed_variable_text(effects[0])} is missing at {curve.port} "
+        f"(probability {probability_text(probability)}), and {laws}: "
+        f"{curve_in_words(curve, force_unit)}."
     )
 
 
@@ -194,17 +205,18 @@ def _forces_of_table(
     forces = functions @ hypothesis.effect
     low, high = _intervals(hypothesis, functions)
     force_unit, motion_unit = problem.model.port_units(port)
-    unit = motion_unit if table.variable == "displacement" else f"{motion_unit}/s"
+    unit = f"{motion_unit}/s" if table.variable == "velocity" else motion_unit
+    kind = "flow" if table.variable == "state" else "force"
     estimates = []
     for number, point in enumerate(table.points[::POINT_STRIDE].tolist()):
         estimates.append(
             ParameterEstimate(
-                name=f"force_at_{point:.3g}_{unit}",
+                name=f"{kind}_at_{point:.3g}_{unit}",
                 value=float(forces[number]),
                 low=float(low[number]),
                 high=float(high[number]),
                 unit=force_unit,
-                description=f"force at a {table.variable} of {point:.3g} {unit}",
+                description=f"{kind} at a {table.variable} of {point:.3g} {unit}",
             )
         )
     return estimates

@@ -56,11 +56,15 @@ def decide_on_remainder(
     # conditions that a name must fulfil
     if comparison.enlarges_error(best_hypothesis):
         return unexplained_outcome(comparison, noise_verdict, best_hypothesis)
+    remaining_error = comparison.reason_of_remaining_error(best_hypothesis)
+    if remaining_error:
+        return unexplained_outcome(comparison, noise_verdict, best_hypothesis, remaining_error)
     probability = comparison.probability(*members)
     if probability < SEARCH.name_probability:
         return unexplained_outcome(comparison, noise_verdict, best_hypothesis)
     log_bayes_factor = best_hypothesis.log_evidence - comparison.no_effect.log_evidence
-    if log_bayes_factor < SEARCH.least_log_bayes_factor:
+    is_proved = comparison.is_proved_curve(best_hypothesis)
+    if log_bayes_factor < SEARCH.least_log_bayes_factor and not is_proved:
         reason = (
             "a missing force without any law explains the readings as well "
             f"(ln Bayes factor {log_bayes_factor:.3g}; a name needs "
@@ -97,7 +101,12 @@ def named_in_part_outcome(
     share = comparison.held_out_or_fitted_share(best_hypothesis)
     families = {term.effect.family for term in best_hypothesis.candidate.terms if term.free_shape}
     family = ", ".join(sorted(families))
-    sentence = curve_sentence(comparison.problem, effects, probability)
+    sentence = curve_sentence(
+        comparison.problem,
+        effects,
+        probability,
+        is_law_open=comparison.has_more_probable_law(best_hypothesis),
+    )
     if not sentence:
         # effects of the catalogue, and families with a shape of their own
         clauses = []
@@ -305,6 +314,10 @@ def unexplained_outcome(
             reason = (
                 f"its probability is {probability:.2g}: a name needs {SEARCH.name_probability:g}"
             )
+            rival = comparison.more_probable_rival(mentioned_hypothesis)
+            if rival is not None:
+                rival_text = effects_text(named_effects(comparison.problem, rival))
+                reason += f", and {rival_text} is more probable"
         nearest = effects_text(named_effects(comparison.problem, mentioned_hypothesis))
         reasons.append(f"The nearest in the catalogue is {nearest}.")
         if reason:

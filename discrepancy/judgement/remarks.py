@@ -3,6 +3,7 @@
 from collections.abc import Iterable, Mapping, Sequence
 from math import floor, log10
 
+from discrepancy.campaign.records import Campaign, TrialKind
 from discrepancy.catalogue.entry import Effect, Setting
 from discrepancy.search.starts import are_related
 from discrepancy.verdict import (
@@ -12,6 +13,7 @@ from discrepancy.verdict import (
     Verdict,
     VerdictKind,
 )
+from fe.runtime.laws.interface import PortForce
 from reporting.words import listing
 
 # ---------------------------------------------------------------- when there is a gap
@@ -140,6 +142,35 @@ def verdict_with_untested_effects(
         return verdict
     it_or_they = "it" if len(names) == 1 else "they"
     sentence = f"Not excluded, because {it_or_they} cannot be tested here: {listing(names)}."
+    return verdict.with_reasons(sentence)
+
+
+def verdict_with_only_sensor(verdict: Verdict, campaign: Campaign) -> Verdict:
+    """Return the verdict with a sentence if the map of the only sensor would look the same.
+
+    At rest under loads at one place, the readings of a single sensor are a curve over the load. A
+    force over the displacement bends it, and so does a sensor whose readings are not in proportion.
+    """
+    trials = campaign.trials
+    channels = {name for trial in trials for name in trial.channels}
+    load_places = {trial.load_place for trial in trials}
+    is_one_curve = (
+        all(trial.kind is TrialKind.STATIC for trial in trials)
+        and len(channels) == 1
+        and len(load_places) == 1
+    )
+    laws = [primitive for effect in verdict.effects for primitive in effect.patch]
+    is_force_over_displacement = bool(laws) and all(
+        isinstance(law, PortForce) and not law.hysteretic and not law.depends_on_speed
+        for law in laws
+    )
+    if verdict.kind not in KINDS_WITH_NAME or not (is_one_curve and is_force_over_displacement):
+        return verdict
+    (channel,) = channels
+    sentence = (
+        f"A sensor {channel} whose readings are not in proportion would look the same, whatever "
+        "its curve: a second sensor, or a release, would tell."
+    )
     return verdict.with_reasons(sentence)
 
 

@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from discrepancy.campaign.records import Campaign, FloatArray, Quantity, Trial
+from discrepancy.campaign.records import BoolArray, Campaign, FloatArray, Quantity, Trial
 from discrepancy.system.linear_system import LinearSystem
 from discrepancy.system.motion import Motion
 from discrepancy.system.output_equation import OutputEquation
@@ -21,6 +21,13 @@ FAR_FROM_MEASURED = 2.0
 """Ratio of a port's computed displacement to its measured one, either way, beyond which its motion
 is scaled by the measured one. What the model lacks can make its motion far too large: near a
 resonance, or in a fall without drag."""
+FAR_IN_SPEED = 1.5
+"""The same ratio for the speed of a free port. It is smaller, since laws of speed are scaled by the
+square of it, or more."""
+WINDOWS_OF_SPEED = 8
+"""Number of windows in a motion; the speed of a free port is compared with its measured one by the
+largest change of displacement within a window. A fall with drag is as long as one without, but
+slower at its end."""
 EXACT_COMBINATION = 1e-9
 """Part of a port's row that no combination of outputs and drives gives, below which it counts as
 zero."""
@@ -200,9 +207,11 @@ class PortScaleEstimator:
             The loads on all unknowns in the motion [N].
         """
         positions, speeds = motion.displacements_and_speeds_at(self.rows)  # (T, P)
-        measured_ratios = self._measured_over_computed(motion, positions, readings)  # (P,)
+        measured_ratios, speed_ratios = self._measured_over_computed(  # (P,) each
+            motion, positions, readings
+        )
         largest_positions = np.max(np.abs(positions), axis=0, initial=0.0) * measured_ratios
-        largest_speeds = np.max(np.abs(speeds), axis=0, initial=0.0) * measured_ratios
+        largest_speeds = np.max(np.abs(speeds), axis=0, initial=0.0) * speed_ratios
         self._add_largest(largest_positions, largest_speeds, is_fitted=is_fitted)
         least_speed = LEAST_REVERSE_SPEED * np.max(np.abs(speeds), axis=0)
         self.turns |= (np.min(speeds, axis=0) < -least_speed) & (
@@ -241,13 +250,14 @@ class PortScaleEstimator:
 
     def _measured_over_computed(
         self, motion: Motion, positions: FloatArray, readings: DisplacementReadings
-    ) -> FloatArray:
-        """Return factors (P,) for ports whose motion was measured to be far from the computed one.
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return factors for ports whose motion was measured to be far from the computed one.
 
         A factor is the largest measured displacement of a port over the largest computed one. The
         factor is 1 for ports that are not measured, for ports of states, and if the two
         displacements differ by less than the factor `FAR_FROM_MEASURED`. A port is measured if its
-        row is a combination of those of channels and drives.
+        row is a combination of those of channels and drives. A free port has no zero of
+        displacement; its speed has a factor of its own, see `WINDOWS_OF_SPEED`.
 
         Parameters
         ----------
@@ -257,11 +267,17 @@ class PortScaleEstimator:
             The computed displacements of the ports [m or rad].
         readings : DisplacementReadings
             The displacements that channels measured.
+
+        Returns
+        -------
+        ratios, speed_ratios : (P,) ndarray
+            The factors on displacements and on speeds.
         """
         ratios = np.ones(len(self.rows))
+        speed_ratios = np.ones(len(self.rows))
         reading_count = len(readings.rows)
         if not reading_count:
-            return ratios
+            return ratios, speed_ratios
         computed_readings, _ = motion.displacements_and_speeds_at(readings.rows)
         drives = motion.system.drives.reshape(-1, self.rows.shape[1])
         known_rows = np.vstack((readings.rows, drives))
@@ -275,14 +291,35 @@ class PortScaleEstimator:
             difference = (readings.values - computed_readings) @ coefficients[:reading_count]
             measured = positions[:, port] + difference  # (T,)
             is_measured = np.isfinite(measured)
-            largest_measured = larger_magnitude(0.0, measured[is_measured])
-            largest_computed = larger_magnitude(0.0, positions[is_measured, port])
-            if largest_measured == 0.0 or largest_computed == 0.0:
-                continue
-            ratio = largest_measured / largest_computed
-            if not 1.0 / FAR_FROM_MEASURED < ratio < FAR_FROM_MEASURED:
-                ratios[port] = ratio
-        return ratios
+            computed = positions[is_measured, port]
+            ratios[port] = _ratio_if_far(
+                larger_magnitude(0.0, measured[is_measured]),
+                larger_magnitude(0.0, computed),
+                FAR_FROM_MEASURED,
+            )
+            speed_ratios[port] = ratios[port]
+            if self._is_free(row):
+                speed_ratios[port] = _ratio_if_far(
+                    _largest_change(measured[is_measured]), _largest_change(computed), FAR_IN_SPEED
+                )
+        return ratios, speed_ratios
+
+    def _is_free(self, row: FloatArray) -> bool:
+        """Return whether only modes without stiffness move a port with a given row (n,)."""
+        count = self.system.displacement_mode_count
+        return not np.any(self.system.angular_frequency[:count][self._moves_port(row)] > 0.0)
+
+    def _moves_port(self, row: FloatArray) -> BoolArray:
+        """Return which modes with displacements move a port with a given row (n,)."""
+        participations = self._participations(row)
+        return participations > LEAST_PARTICIPATION * float(participations.sum())
+
+    def _participations(self, row: FloatArray) -> FloatArray:
+        """Return the squared amplitude of a port per unit of each mode with displacements.
+
+        The shapes have a modal mass of one.
+        """
+        return (row @ self.system.shapes)[: self.system.displacement_mode_count] ** 2
 
     def _add_largest(
         self, displacements: FloatArray, speeds: FloatArray, *, is_fitted: bool
@@ -349,10 +386,9 @@ class PortScaleEstimator:
         # modes that move the port
         angular_frequencies = system.angular_frequency[: system.displacement_mode_count]
         row = self.rows[port_index]
-        # squared amplitude of the port per unit of each mode (shapes have a modal mass of one)
-        participations = (row @ system.shapes)[: system.displacement_mode_count] ** 2
-        moves_port = participations > LEAST_PARTICIPATION * float(participations.sum())
-        is_free = not np.any(angular_frequencies[moves_port] > 0.0)
+        participations = self._participations(row)
+        moves_port = self._moves_port(row)
+        is_free = self._is_free(row)
         is_held = np.any(moves_port) and np.all(angular_frequencies[moves_port] > 0.0)
         if not is_held:
             is_known_not_to_turn = is_free and only_driven and np.any(moves_port)
@@ -389,6 +425,20 @@ class PortScaleEstimator:
             static_stiffness=static_stiffness,
             largest_displacement=largest_displacement or 1.0,
         )
+
+
+def _ratio_if_far(measured: float, computed: float, far: float) -> float:
+    """Return a measured over a computed magnitude, or one unless they differ by a factor `far`."""
+    if measured == 0.0 or computed == 0.0:
+        return 1.0
+    ratio = measured / computed
+    return 1.0 if 1.0 / far < ratio < far else ratio
+
+
+def _largest_change(values: FloatArray) -> float:
+    """Return the largest change of a series within one of its windows."""
+    step = max(len(values) // WINDOWS_OF_SPEED, 1)
+    return float(np.max(np.abs(values[step:] - values[:-step]), initial=0.0))
 
 
 def _combination_of(known_rows: FloatArray, row: FloatArray) -> FloatArray | None:

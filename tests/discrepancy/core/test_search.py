@@ -183,6 +183,12 @@ class TwoRivals:
     def absolute_fit(self, item):
         return SimpleNamespace(has_failed=not self.fits)
 
+    def reason_of_remaining_error(self, item):
+        return ""
+
+    def is_proved_curve(self, item):
+        return False
+
 
 @pytest.mark.parametrize(
     ("probability", "gain", "fits", "kind"),

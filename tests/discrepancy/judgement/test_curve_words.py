@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 from discrepancy.catalogue.force_curve import curve_points
-from discrepancy.judgement.curve_words import curve_in_words
-from fe.runtime.patch import TableDamping, TableStiffness
+from discrepancy.judgement.curve_words import curve_in_words, followed_variable_text
+from discrepancy.verdict import NamedEffect
+from fe.runtime.patch import ModelPatch, TableDamping, TableStiffness
 
 VELOCITIES = curve_points("velocity", -0.5, 0.5)
 DISPLACEMENTS = np.linspace(-0.02, 0.02, 49)
@@ -82,3 +83,37 @@ def test_the_motion_of_a_moment_is_told_in_radians():
 )
 def test_friction_is_told_by_its_shape(forces, words):
     assert curve_in_words(TableDamping("p", tuple(VELOCITIES), tuple(forces)), "N") == words
+
+
+def test_a_flow_is_told_at_three_states():
+    levels = np.linspace(0.2, 1.0, 49)
+    curve = TableDamping("p", tuple(levels), tuple(0.03 * levels**2))
+    assert curve_in_words(curve, "m/s times capacity") == (
+        "it is 0.0012 at 0.2 m, 0.0108 at 0.6 m and 0.03 at 1 m (in m/s times capacity)"
+    )
+
+
+def test_a_force_that_is_no_power_of_the_motion_is_told_at_three_points():
+    forces = 0.2 * np.sin(400.0 * DISPLACEMENTS)
+    curve = TableStiffness("p", tuple(DISPLACEMENTS), tuple(forces))
+    assert curve_in_words(curve, "N") == "it is −0.198 at −0.02 m, 0 at 0 m and 0.198 at 0.02 m (in N)"
+
+
+def test_a_motion_in_one_direction_does_not_tell_that_the_other_is_free():
+    speeds = np.linspace(0.0, 5.0, 49)
+    curve = TableDamping("p", tuple(speeds), tuple(2.0 * speeds**2))
+    assert curve_in_words(curve, "N") == ("it grows to 50 N at 5 m/s, about as the power 2 of the velocity")
+
+
+@pytest.mark.parametrize(
+    ("identifier", "law", "words"),
+    [
+        ("force_over_displacement", TableStiffness, "force that follows the displacement"),
+        ("force_over_velocity", TableDamping, "force that follows the velocity"),
+        ("flow_over_state", TableDamping, "flow that follows the state"),
+    ],
+)
+def test_what_a_force_of_free_shape_follows_is_told(identifier, law, words):
+    patch = ModelPatch((law("p", (0.0, 1.0), (0.0, 1.0)),))
+    effect = NamedEffect(identifier, "name", "p", "family", (), (), patch)
+    assert followed_variable_text(effect) == words
