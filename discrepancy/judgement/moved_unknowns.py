@@ -15,7 +15,7 @@ from discrepancy.fits.fitting import CandidateFit
 from discrepancy.fits.problem import Problem
 from discrepancy.fits.trial_data import TrialData
 from discrepancy.verdict import MovedUnknown, SensorEstimate, SensorValue
-from reporting.words import listing, plus_minus
+from reporting.words import listing, plus_minus, significant
 
 from .hypotheses import calibrated_parameters
 from .sensor_estimates import sensor_estimates
@@ -312,13 +312,15 @@ def _moved_text(unknown: MovedUnknown) -> str:
     unit = "" if unknown.unit == "1" else f" {unknown.unit}"
     if name.startswith(GAIN_OF):
         stated_text = f"stated to {100.0 * stated_deviation:.3g} %"
-        return f"the {name} by {100.0 * value:+.3g} % ({stated_text}; {distance_text})"
+        side = "much" if value > 0.0 else "little"
+        error = f"{100.0 * abs(value):.3g} % too {side}"
+        return f"the {name} to {error} ({stated_text}; {distance_text})"
     if unknown.stated == 0.0:
         factor = 1.0
         if name.startswith(ZERO_OF) and unknown.unit in DRAWN_UNITS:
             factor, drawn_unit = DRAWN_UNITS[unknown.unit]
             unit = f" {drawn_unit}"
         stated_text = f"stated to {factor * stated_deviation:.3g}{unit}"
-        return f"the {name} to {factor * value:.3g}{unit} ({stated_text}; {distance_text})"
+        return f"the {name} to {significant(factor * value)}{unit} ({stated_text}; {distance_text})"
     stated_text = f"{unknown.stated:.4g} ± {stated_deviation:.2g}"
     return f"{name} from {stated_text} to {value:.4g}{unit} ({distance_text})"

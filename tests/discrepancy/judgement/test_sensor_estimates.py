@@ -182,7 +182,7 @@ def test_gains_that_moved_within_their_priors_are_told(hidden_in_gains):
 def test_nothing_missing_says_which_gain_an_error_may_hide_in(hidden_in_gains):
     moved = {unknown.name: unknown for unknown in hidden_in_gains.moved_within_prior}
     percent = 100.0 * moved["gain of g3"].value
-    assert f"the gain of g3 by {percent:+.3g} % (stated to 12 %;" in hidden_in_gains.text
+    assert f"the gain of g3 to {percent:.3g} % too much (stated to 12 %;" in hidden_in_gains.text
     assert "an error of the model of this size would not show" in hidden_in_gains.text
 
 
@@ -217,7 +217,7 @@ def test_a_gain_far_from_what_is_stated_is_told_with_its_deviation(value, side):
 
 def test_a_moved_zero_has_the_unit_of_the_report():
     moved = MovedUnknown("zero of g2 in 'unloading'", 0.0, 8e-7, -1.8e-6, -2.25, "1")
-    told = "the zero of g2 in 'unloading' to -1.8 µε (stated to 0.8 µε; 2.2 deviations)"
+    told = "the zero of g2 in 'unloading' to −1.8 µε (stated to 0.8 µε; 2.2 deviations)"
     assert told in moved_sentence([moved])
 
 

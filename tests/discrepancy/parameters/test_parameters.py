@@ -304,8 +304,8 @@ def test_the_gain_of_a_sensor_has_the_posterior_of_the_closed_form(known_spring)
 
 def test_a_gain_that_is_far_from_what_is_stated_is_named(known_spring):
     (sentence,) = [finding for finding in known_spring.findings if "moves" in finding]
-    assert "the gain of y by +1." in sentence
-    assert "(stated to 0.5 %;" in sentence
+    assert "the gain of y to 1." in sentence
+    assert " % too much (stated to 0.5 %;" in sentence
 
 
 def test_the_file_of_a_calibration_holds_gains_and_zeros(known_spring, tmp_path):
