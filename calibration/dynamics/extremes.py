@@ -24,7 +24,8 @@ _INSTANTS = 17  # within a column of pixels, at which the model is evaluated
 def refine_by_extremes(trials: Fits) -> Fits:
     """Fit trials again, to the extremes of their records.
 
-    Amplitudes, phases and decay rates are fitted; damped frequencies keep their values.
+    Amplitudes, phases, decay rates, offset, drift and the thickness of the drawn line are fitted;
+    damped frequencies keep their values.
 
     Raises
     ------

@@ -1,6 +1,7 @@
 """Calibration step 2, as in Fig. 5 of the paper: e and tip stiffness, exactly and by particles."""
 
 import math
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -161,23 +162,12 @@ def particle_filter(
     likelihood_grid = prior.mean + prior.standard_deviation * standardised_grid
     window = float(likelihood_grid[0]), float(likelihood_grid[-1])
 
-    # Weights, pair by pair. A product of likelihoods would underflow, so logarithms are added.
-    log_weight = np.zeros(particle_count)
-    likelihood = np.zeros((data.count, likelihood_grid.size))
+    pair_densities = []
     for pair in range(data.count):
-        density = _pair_density(data, pair, curve, window, pair_generator, particle_count)
-        likelihood[pair] = density.at(likelihood_grid)
-        with np.errstate(divide="ignore"):  # a particle that no sample reaches has weight zero
-            log_weight += np.log(density.at(particles))
-        if float(log_weight.max()) == -math.inf:
-            raise PosteriorError(
-                f"no particle explains pair {pair + 1} ({data.load[pair]:g} N, "
-                f"{data.displacement[pair] * 1e3:g} mm) of {data.source} and those before it; "
-                f"check the prior N({prior.mean:g}, {prior.standard_deviation:.3g}^2), the units "
-                "and the curve."
-            )
-    weight = np.exp(log_weight - float(log_weight.max()))
-    weight /= weight.sum()
+        pair_densities.append(
+            _pair_density(data, pair, curve, window, pair_generator, particle_count)
+        )
+    weight = _particle_weights(particles, pair_densities, data, prior)
     effective_size = 1.0 / float(np.sum(weight**2))
     if effective_size < _FEWEST_EFFECTIVE_PARTICLES:
         raise PosteriorError(
@@ -201,7 +191,7 @@ def particle_filter(
         mean=moments_of_e.mean,
         standard_deviation=moments_of_e.standard_deviation,
         likelihood_grid=likelihood_grid,
-        likelihood=likelihood,
+        likelihood=np.array([density.at(likelihood_grid) for density in pair_densities]),
         stiffness=ScalarPosterior(
             stiffness_density.grid,
             stiffness_density.density,
@@ -209,6 +199,33 @@ def particle_filter(
             standard_deviation=stiffness.standard_deviation,
         ),
     )
+
+
+def _particle_weights(
+    particles: Float,
+    pair_densities: Sequence[KernelDensity],
+    data: LoadDisplacementData,
+    prior: GaussianPrior,
+) -> Float:
+    """Return weights (N,) of the particles, whose sum is 1: the product of the pairs' likelihoods.
+
+    Raises `PosteriorError` if no particle explains a pair and those before it.
+    """
+    # a product of likelihoods would underflow, so logarithms are added
+    log_weight = np.zeros(particles.size)
+    for pair, density in enumerate(pair_densities):
+        with np.errstate(divide="ignore"):  # a particle that no sample reaches has weight zero
+            log_weight += np.log(density.at(particles))
+        if float(log_weight.max()) == -math.inf:
+            raise PosteriorError(
+                f"no particle explains pair {pair + 1} ({data.load[pair]:g} N, "
+                f"{data.displacement[pair] * 1e3:g} mm) of {data.source} and those before it; "
+                f"check the prior N({prior.mean:g}, {prior.standard_deviation:.3g}^2), the units "
+                "and the curve."
+            )
+    weight = np.exp(log_weight - float(log_weight.max()))
+    weight /= weight.sum()
+    return np.asarray(weight)
 
 
 def _pair_density(

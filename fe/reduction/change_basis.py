@@ -165,8 +165,8 @@ class _Columns:
     def add_motion(self, motion: SupportMotion) -> None:
         """Add the columns of a support motion: its unit response, and responses to their inertia.
 
-        The unit response is the displacement if the support moves by one; it also is added as it
-        changes with the parameters.
+        The unit response is the displacement if the support moves by one. Its changes with the
+        parameters and losses are added, too.
         """
         number = 1 + self.structure.support_motions.index(motion)
         is_held = motion.spring == 0.0

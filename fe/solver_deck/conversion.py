@@ -144,28 +144,11 @@ def _convert(deck: Path, folder: Path, name: str, options: DeckOptions) -> DeckR
 def _structure_of_deck(
     jobs: CalculixJobs, blocks: list[KeywordBlock], regions: list[Region], options: DeckOptions
 ) -> tuple[DeckStructure, list[str]]:
-    """Return a deck as matrices, and sentences on loads that are left out."""
+    """Return a deck as matrices, and remarks on its regions, its loads and its mass."""
     model = jobs.model
     unloaded = jobs.matrices("whole", blocks)
     matrices = _preloaded_matrices(jobs, blocks, unloaded)
-    remarks: list[str] = []
-    region_stiffness = {}
-    for number, region in enumerate(regions, start=1):
-        changed = jobs.matrices(
-            f"region{number}", with_scaled_modulus(blocks, number, _CHANGED_MODULUS)
-        )
-        if changed.dofs != unloaded.dofs:
-            raise CalculixError(
-                f"{model.path}: the matrices of one run have other rows when the modulus of "
-                f"{region.set_name} changes; name other regions by --region."
-            )
-        difference = unloaded.stiffness - changed.stiffness
-        if abs(difference).max() > _ROUNDING * abs(unloaded.stiffness).max():
-            region_stiffness[region] = (difference / (1.0 - _CHANGED_MODULUS)).tocsr()
-        else:
-            remarks.append(
-                f"{region.set_name} is no region: its modulus changes nothing that can move"
-            )
+    region_stiffness, remarks = _stiffness_of_regions(jobs, blocks, regions, unloaded)
     if model.preload and region_stiffness:
         weight = _stable_weight(model, matrices.stiffness, list(region_stiffness.values()))
         region_stiffness = {
@@ -192,6 +175,37 @@ def _structure_of_deck(
         length_unit=options.length_unit,
     )
     return structure, remarks
+
+
+def _stiffness_of_regions(
+    jobs: CalculixJobs,
+    blocks: list[KeywordBlock],
+    regions: list[Region],
+    unloaded: StoredMatrices,
+) -> tuple[dict[Region, sparse.csr_array], list[str]]:
+    """Return the stiffness of each region, and remarks on sets that have none.
+
+    It follows from the stiffness of the structure with a smaller modulus in the region.
+    """
+    region_stiffness: dict[Region, sparse.csr_array] = {}
+    remarks: list[str] = []
+    for number, region in enumerate(regions, start=1):
+        changed = jobs.matrices(
+            f"region{number}", with_scaled_modulus(blocks, number, _CHANGED_MODULUS)
+        )
+        if changed.dofs != unloaded.dofs:
+            raise CalculixError(
+                f"{jobs.model.path}: the matrices of one run have other rows when the modulus of "
+                f"{region.set_name} changes; name other regions by --region."
+            )
+        difference = unloaded.stiffness - changed.stiffness
+        if abs(difference).max() > _ROUNDING * abs(unloaded.stiffness).max():
+            region_stiffness[region] = (difference / (1.0 - _CHANGED_MODULUS)).tocsr()
+        else:
+            remarks.append(
+                f"{region.set_name} is no region: its modulus changes nothing that can move"
+            )
+    return region_stiffness, remarks
 
 
 def _stable_weight(

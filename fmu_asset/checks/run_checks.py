@@ -98,14 +98,14 @@ class RunChecks:
         try:
             self._first_outputs = self._run()
         except FmuError as error:
-            yield Finding("first flight", "problem", one_line(error))
+            yield Finding("first run", "problem", one_line(error))
             yield self._check_sandbox().named("sandbox")
             for name in [*checks, "instances"]:
-                yield Finding(name, "skipped", "It does not fly.")
+                yield Finding(name, "skipped", "The first run failed.")
             return
         count = self._first_outputs.shape[1]
         text = f"{RUN_STEPS} steps of {self._binding.interval:g} s, {count} finite outputs."
-        yield Finding("first flight", "ok", text)
+        yield Finding("first run", "ok", text)
         yield self._check_sandbox().named("sandbox")
         for name, check in checks.items():
             with progress.stage(f"Checking {name}"):
@@ -182,11 +182,11 @@ class RunChecks:
         """Check that runs in two processes give bitwise equal outputs."""
         outputs = self._run()
         if outputs.tobytes() == self._first_outputs.tobytes():
-            return CheckResult("ok", "Two flights in two processes are equal to the bit.")
+            return CheckResult("ok", "Two runs in two processes are equal to the bit.")
         difference = _first_difference(self._first_outputs, outputs)
         text = (
-            f"Two flights with the same inputs differ ({difference}): runs of it are not "
-            "reproducible, and a state cannot be replayed."
+            f"Two runs with the same inputs differ ({difference}): its runs are not reproducible, "
+            "and a state cannot be replayed."
         )
         return CheckResult("problem", text)
 
@@ -207,7 +207,7 @@ class RunChecks:
             if method == "serialised":
                 cause = partial_state_sentence("keeps part of its state elsewhere")
             text = (
-                "A flight that goes on from a saved state in a new process differs from the one "
+                "A run that resumes from a saved state in a new process differs from the one "
                 "that was not interrupted "
                 f"({_first_difference(expected_outputs, resumed_outputs)}): {cause}."
             )

@@ -473,7 +473,7 @@ def warn_without_sandbox(label: str, grants: Grants | None) -> None:
     elif not landlock_version():
         warning = (
             "This kernel has no Landlock (Linux 5.13 or later), so that FMUs have all rights of "
-            "their user; fly what is not trusted in a container."
+            "their user; run FMUs that you do not trust in a container."
         )
     else:
         return

@@ -357,7 +357,7 @@ def test_one_fault_is_one_problem(foreign_fmu, monkeypatch, fault, check, senten
     verdicts = verdicts_of(result)
     assert (result.passed, verdicts[check]) == (False, "problem")
     assert sentence in text_of(result, check)
-    if check == "first flight":  # after which nothing more is tried
+    if check == "first run":  # after which nothing more is tried
         assert (len(result.problems), verdicts["state"]) == (1, "skipped")
 
 
@@ -424,10 +424,10 @@ def test_a_binding_with_other_sizes_is_checked_with_them(foreign_fmu):
     check = check_fmu(foreign_fmu("resize3"), sized, cycles=2)
 
     passed = {name for name, verdict in verdicts_of(check).items() if verdict == "ok"}
-    assert "3 finite outputs" in text_of(check, "first flight")
+    assert "3 finite outputs" in text_of(check, "first run")
     assert passed >= {
         "binding",
-        "first flight",
+        "first run",
         "determinism",
         "step size",
         "reset",
