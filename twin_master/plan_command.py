@@ -183,7 +183,7 @@ def _plan_mission(knowledge: "Knowledge") -> "tuple[BeliefPlan, ComparedPolicy]"
 
     scenario = knowledge.scenario
     problem = knowledge.problem
-    plan, _price = plan_within_limit(scenario, problem, knowledge.rewards)
+    plan = plan_within_limit(scenario, problem, knowledge.rewards)
     return plan, simulate_policy(scenario, problem, plan.policy)
 
 

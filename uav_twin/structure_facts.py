@@ -161,7 +161,11 @@ def print_structure(record: JsonRecord) -> None:
         terminal.say(f"Note: {remark}")
     if record["parts"]:
         headings = ("part", "name", "set", "holds", "note")
-        terminal.print_table(headings, [_part_row(part) for part in record["parts"]])
+        rows = []
+        for part in record["parts"]:
+            contents = f"{part['count']:,} {part['of']}"
+            rows.append((part["what"], part["name"], part["set"], contents, part["note"]))
+        terminal.print_table(headings, rows)
     if record["frequencies"]:
         modes = enumerate(record["frequencies"], start=1)
         rows = [(str(number), f"{frequency:.6g}") for number, frequency in modes]
@@ -212,12 +216,6 @@ def _mesh_rows(record: JsonRecord) -> list[tuple[str, ...]]:
 def _point_text(point: list[float]) -> str:
     """Return the coordinates of a point as a text."""
     return ", ".join(f"{coordinate:.6g}" for coordinate in point)
-
-
-def _part_row(part: JsonRecord) -> tuple[str, ...]:
-    """Return the cells of a part, given as the dictionary of a `StructurePart`."""
-    contents = f"{part['count']:,} {part['of']}"
-    return (part["what"], part["name"], part["set"], contents, part["note"])
 
 
 def _print_load(load: JsonRecord) -> None:

@@ -307,14 +307,18 @@ class CoupledSource(SeveralSource):
             # A scenario with this design has a calibration file: `resolve_scenario` checks it.
             calibration = load_calibration(Path(self._scenario.calibration.file or ""))
             design = calibration.wing_design
-            # `tailoring` gives the options of `pack_wing` that set the calibrated values.
-            options = tailoring(calibration)
-            pack_wing(
-                design, fmu, replace=True, progress=progress, kind=component.packed, **options
-            )
+            calibrated_values = tailoring(calibration)
         else:
             design = load_design(component.design_path)
-            pack_wing(design, fmu, replace=True, progress=progress, kind=component.packed)
+            calibrated_values = {}
+        pack_wing(
+            design,
+            fmu,
+            replace=True,
+            progress=progress,
+            kind=component.packed,
+            **calibrated_values,
+        )
         return fmu
 
     def wiring(self) -> "Wiring":

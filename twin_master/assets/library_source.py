@@ -31,6 +31,7 @@ from twin_master.network.graphical_model import (
     GraphicalModel,
     StateSpace,
     build_graphical_model,
+    interpolation_weights,
 )
 from twin_master.scenario.kinds import BeliefSection
 from twin_master.scenario.schema import Scenario
@@ -245,14 +246,10 @@ class ObservationLibrary:
         if draws.min() < nodes[0] - tolerance or draws.max() > nodes[-1] + tolerance:
             raise MissionInputError(
                 f"the draws of {name} reach from {draws.min():.6g} to {draws.max():.6g}, but the "
-                f"observation library from {nodes[0]:.6g} to {nodes[-1]:.6g}: sample one for this "
-                f"scenario and seed, or over a wider range with --grid parameter.{name}=..."
+                f"observation library covers {nodes[0]:.6g} to {nodes[-1]:.6g}: sample one for "
+                f"this scenario and seed, or over a wider range with --grid parameter.{name}=..."
             )
-        # The weight of a node is the piecewise linear function that is 1 at this node and 0 at the
-        # others; the array is (nodes, N).
-        weights = np.array(
-            [np.interp(draws, nodes, node_values) for node_values in np.eye(len(nodes))]
-        )
+        weights = interpolation_weights(nodes, draws)  # (nodes, N)
         return np.tensordot(weights.T, self.values[order], axes=1)
 
 

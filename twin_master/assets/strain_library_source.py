@@ -25,7 +25,12 @@ from twin_master.assets.asset_source import (
 )
 from twin_master.assets.parameter import ParameterDraws
 from twin_master.errors import MissionInputError, check_names
-from twin_master.network.graphical_model import Factor, GraphicalModel, StateSpace
+from twin_master.network.graphical_model import (
+    Factor,
+    GraphicalModel,
+    StateSpace,
+    interpolation_weights,
+)
 from twin_master.scenario.kinds import AssetSection, BeliefSection
 from twin_master.scenario.schema import Scenario
 
@@ -102,11 +107,7 @@ class StrainLibrary:
                     f"the strain library covers {factor.name} from {levels[0]:g} to "
                     f"{levels[-1]:g}, but the state has {loss:g}."
                 )
-            # The weight of a level is the piecewise linear function that is 1 at this level and 0
-            # at the others.
-            weights = [
-                np.interp(loss, levels, level_values) for level_values in np.eye(len(levels))
-            ]
+            weights = interpolation_weights(np.array(levels), loss)
             strain = np.tensordot(weights, strain, axes=1)
         return strain
 

@@ -50,14 +50,12 @@ def feed_of_lines(scenario: Scenario, stream: IO[bytes]) -> Feed:
 
 
 def feed_of_mappings(scenario: Scenario, messages: Iterable[Mapping[str, object]]) -> Feed:
-    """Return the feed of a program's messages, which may have arrays instead of lists."""
-    contents = (json.dumps(message, default=_as_list).encode() for message in messages)
+    """Return the feed of a program's messages, which may have arrays and scalars of NumPy."""
+    contents = (
+        json.dumps(message, default=lambda value: np.asarray(value).tolist()).encode()
+        for message in messages
+    )
     return Feed(_read_messages(scenario, contents))
-
-
-def _as_list(value: object) -> object:
-    """Return an array as nested lists, and a scalar of NumPy as a number."""
-    return np.asarray(value).tolist()
 
 
 def file_feed(

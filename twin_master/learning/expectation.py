@@ -16,6 +16,7 @@ from reporting.arrays import Float
 from twin_master.learning.learning_filter import LearningFilter, StaticHypotheses
 from twin_master.learning.saturation import LOST_FRACTIONS
 from twin_master.network.estimator import Carried, Learnt
+from twin_master.network.graphical_model import interpolation_weights
 from twin_master.network.quantity import RewardModel
 from twin_master.network.sensor_model import GaussianSensorModel
 
@@ -382,14 +383,14 @@ def _interpolating_weights(points: ArrayLike, posterior: Learnt) -> Float:
     """Return weights of points (n,) with the mean and standard deviation of a posterior.
 
     Two values, one standard deviation on either side of the mean and each with the probability one
-    half, are interpolated between the points. The weight of a point is then its hat function: one
-    at the point, zero at all others.
+    half, are interpolated between the points.
     """
     values = np.asarray(points, dtype=np.float64)
     order = np.argsort(values)
     two_values = posterior.mean + np.array([-1.0, 1.0]) * posterior.standard_deviation
-    hat_functions = np.eye(len(values))[:, order]
-    return np.array([np.interp(two_values, values[order], hat).mean() for hat in hat_functions])
+    weights = np.empty(len(values))
+    weights[order] = interpolation_weights(values[order], two_values).mean(axis=1)
+    return weights
 
 
 def _insert_state_and_control(values: Float) -> Float:

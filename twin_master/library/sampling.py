@@ -236,7 +236,7 @@ def _prepare_folder(out: Path, record: JsonObject, *, resume: bool, replace_exis
     """
     if out.suffix != ".nc":
         raise MissionInputError(
-            f"an observation library must have the suffix .nc, and {out} was given."
+            f"an observation library must have the suffix .nc, but {out} was given."
         )
     folder = blocks_folder(out)
     plan_file = folder / PLAN_NAME

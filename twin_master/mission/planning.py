@@ -43,7 +43,7 @@ def discounts(scenario: Scenario) -> Float:
 
 def plan_within_limit(
     scenario: Scenario, problem: DecisionProblem, rewards: RewardModel
-) -> tuple[BeliefPlan, float]:
+) -> BeliefPlan:
     """Return the plan on the belief that exceeds the health limit no more often than allowed.
 
     The scenario may bound the fraction of steps beyond the limit (`planner.limit_probability`).
@@ -54,14 +54,6 @@ def plan_within_limit(
     ----------
     problem : DecisionProblem
         The decision problem of the mission, without a price.
-
-    Returns
-    -------
-    plan : BeliefPlan
-        The plan.
-    price : float
-        The price of a step beyond the limit for which it was made, in rewards; zero if there is no
-        limit, or if the plan without a price keeps it.
 
     Raises
     ------
@@ -85,7 +77,7 @@ def plan_within_limit(
 
     without_price = plan_with_price(0.0)
     if keeps_limit(without_price):
-        return without_price, 0.0
+        return without_price
 
     # Raise the price until the bound holds.
     too_low = 0.0
@@ -110,7 +102,7 @@ def plan_within_limit(
             price = middle_price
         else:
             too_low = middle_price
-    return cheapest_plan, price
+    return cheapest_plan
 
 
 def _probability_beyond_limit(rewards: RewardModel) -> Float:

@@ -225,8 +225,7 @@ class Knowledge:
             # returns for each control (Littman, Cassandra and Kaelbling 1995).
             return BeliefPolicy(plan.action_value.T, np.arange(len(self.scenario.control)))
         if self.scenario.planner.policy == "belief":
-            belief_plan, _price = plan_within_limit(self.scenario, self.problem, self.rewards)
-            return belief_plan.policy
+            return plan_within_limit(self.scenario, self.problem, self.rewards).policy
         return None
 
     @cached_property

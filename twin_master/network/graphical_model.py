@@ -27,6 +27,15 @@ from twin_master.scenario.schema import Scenario
 from twin_master.scenario.tables import probability_of
 
 
+def interpolation_weights(nodes: Float, values: ArrayLike) -> Float:
+    """Return the weight (n, ...) of each of n increasing nodes in a linear interpolation at values.
+
+    It is the hat function of the node: piecewise linear, one at the node and zero at all others.
+    """
+    values = np.asarray(values, dtype=np.float64)
+    return np.array([np.interp(values, nodes, hat) for hat in np.eye(len(nodes))])
+
+
 @dataclass(frozen=True)
 class Factor:
     """One named component of the state, and the levels that it can take.
