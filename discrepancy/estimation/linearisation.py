@@ -1,7 +1,7 @@
 """All trials of a hypothesis, linear along their trajectories, as one linear regression."""
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -72,6 +72,10 @@ class Linearisation:
                 yield FilteredTrial(linear_trial, processes)
             else:
                 yield RestUnderForces(linear_trial, processes)
+
+    def without_cached_arrays(self) -> "Linearisation":
+        """Return the same trials without the arrays that were computed from them: tens of MB."""
+        return replace(self, trials=tuple(replace(trial) for trial in self.trials))
 
     def regression(self, filtered_trials: Iterable[FilteredTrial | RestUnderForces]) -> Regression:
         """Return the normal equations of all unknowns but the local ones.

@@ -32,6 +32,9 @@ BEAM_WIDTHS = (4, 2, 2)
 """Numbers of these rough estimates that are then estimated in full."""
 ESTIMATED_RANGE = 60.0
 """Difference to the best score above which a hypothesis is not estimated in full [nat]."""
+MOST_SETTLING_ESTIMATES, LEAST_SETTLING_RISE = 4, 2.0
+"""Largest number of times that the estimate of the best hypothesis is repeated, and the rise of its
+evidence [nat] below which it is not repeated again."""
 LEADING_RANGE = 12.0
 """Difference to the best score of the first round above which a hypothesis is dropped [nat]. In all
 samples the difference is larger by about the factor of the thinning."""
@@ -106,6 +109,7 @@ def rank_hypotheses(
     for rough_count, beam_width in counts_by_length[:largest_set]:
         rough_estimates = ranking.rough_estimates(best_estimate, rough_count)
         ranking.estimate_in_full(best_estimate, rough_estimates, beam_width)
+        ranking.settle_best()
         ranking.estimate_simpler_forms()
         is_first_effect = not best_estimate.candidate.terms
         is_improved = ranking.best is not best_estimate
@@ -204,9 +208,9 @@ class _Ranking:
                 if estimate is not None:
                     estimates_of_effect.append(estimate)
             if estimates_of_effect:
-                rough_estimates.append(
-                    max(estimates_of_effect, key=lambda estimate: estimate.log_evidence)
-                )
+                best_estimate = max(estimates_of_effect, key=lambda estimate: estimate.log_evidence)
+                linearisation = best_estimate.linearisation.without_cached_arrays()
+                rough_estimates.append(replace(best_estimate, linearisation=linearisation))
         for estimate in rough_estimates:
             self.record(estimate)
         return sorted(rough_estimates, key=lambda estimate: -self.score(estimate))
@@ -239,6 +243,23 @@ class _Ranking:
             if self.by_effects[candidate.key] is rough_estimate:
                 self.record(self.search.estimate_about_own_values(rough_estimate))
             self.estimated_in_full.add(candidate.key)
+
+    def settle_best(self) -> None:
+        """Repeat the estimate of the best hypothesis, as long as its evidence rises.
+
+        Otherwise a further effect may seem to explain something only because its estimate began
+        where this one ended.
+        """
+        for _ in range(MOST_SETTLING_ESTIMATES):
+            best_estimate = self.best
+            is_settled = best_estimate.converged or best_estimate.leaves_no_force
+            if is_settled or not best_estimate.candidate.terms:
+                return
+            self.on_progress(f"estimating {best_estimate.candidate.description} again")
+            repeated_estimate = self.search.estimate_about_own_values(best_estimate)
+            self.record(repeated_estimate)
+            if self.score(repeated_estimate) < self.score(best_estimate) + LEAST_SETTLING_RISE:
+                return
 
     def estimate_simpler_forms(self) -> None:
         """Estimate the simpler forms of the best hypothesis, as long as one of them is better.

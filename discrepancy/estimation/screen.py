@@ -58,6 +58,9 @@ LARGEST_RATIO = 1e100
 CREEP_SHARE = 0.02
 """Fraction of the rms speed below which a body creeps and does not slide, so that its friction is
 not a function of the speed."""
+MOST_COLUMNS = 60
+"""Number of effects that are weighed in one pass of the filter. More need more memory, and hardly
+less time for each."""
 TIED_EVIDENCE = 1.0
 """Difference to the log evidence of the best values of an effect up to which estimates begin at its
 other values, too [nat]."""
@@ -146,7 +149,11 @@ def screen_effects(
         The estimate to which an effect is added.
     """
     tried_effects = _try_effects(search, base, effects)
-    evidence_of_base, weighed_effects = _weigh_effects(base, tried_effects)
+    evidence_of_base = -inf
+    weighed_effects: list[tuple[TriedEffect, ScreenedStart]] = []
+    for begin in range(0, len(tried_effects), MOST_COLUMNS):
+        evidence_of_base, starts = _weigh_effects(base, tried_effects[begin : begin + MOST_COLUMNS])
+        weighed_effects += starts
     starts_by_term: dict[EffectTerm, list[ScreenedStart]] = {}
     for tried_effect, start in weighed_effects:
         starts_by_term.setdefault(tried_effect.term, []).append(start)
@@ -311,8 +318,6 @@ def _weigh_effects(
         The effects, each with its best start.
     """
     evidence_of_base = -inf
-    if not tried_effects:
-        return evidence_of_base, []
     with_columns = _with_columns(base, tried_effects)
     base_count = len(base.linearisation.priors)
     best_starts: dict[int, ScreenedStart] = {}

@@ -296,12 +296,13 @@ def _forces_by_trial(
     port, and `recorded` has the trials as they were recorded, by name.
     """
     trial_forces = []
-    filtered_trials = estimate.linearisation.filter(estimate.processes)
-    trials = list(zip(filtered_trials, estimate.trials, strict=True))
     # the few load steps at rest tell little beside records in motion
-    in_motion = [pair for pair in trials if not pair[1].trial.is_at_rest]
-    for filtered_trial, smoothed_trial in in_motion or trials:
+    leaves_out_rest = any(not trial.trial.is_at_rest for trial in estimate.trials)
+    filtered_trials = estimate.linearisation.filter(estimate.processes)
+    for smoothed_trial, filtered_trial in zip(estimate.trials, filtered_trials, strict=True):
         trial = smoothed_trial.trial
+        if trial.is_at_rest and leaves_out_rest:
+            continue
         samples = slice(None, None, trial.substeps)
         law_force = smoothed_trial.effect_forces[port][samples] if has_law else None
         trial_forces.append(
