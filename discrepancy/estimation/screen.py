@@ -152,8 +152,9 @@ def screen_effects(
     evidence_of_base = -inf
     weighed_effects: list[tuple[TriedEffect, ScreenedStart]] = []
     for begin in range(0, len(tried_effects), MOST_COLUMNS):
-        evidence_of_base, starts = _weigh_effects(base, tried_effects[begin : begin + MOST_COLUMNS])
-        weighed_effects += starts
+        some_effects = tried_effects[begin : begin + MOST_COLUMNS]
+        evidence_of_base, weighed_of_these = _weigh_effects(base, some_effects)
+        weighed_effects += weighed_of_these
     starts_by_term: dict[EffectTerm, list[ScreenedStart]] = {}
     for tried_effect, start in weighed_effects:
         starts_by_term.setdefault(tried_effect.term, []).append(start)

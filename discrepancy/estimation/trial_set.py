@@ -6,6 +6,7 @@ all samples.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -13,7 +14,7 @@ from discrepancy.campaign.records import FloatArray
 from discrepancy.fits.candidate import Candidate, Point
 from discrepancy.fits.problem import Problem
 from discrepancy.trials_in_motion.effects import EffectLaws
-from discrepancy.trials_in_motion.ported_trial import ported_trial, thin_trial
+from discrepancy.trials_in_motion.ported_trial import ported_trial, thin_trial, thinning_stride
 from discrepancy.trials_in_motion.trajectory import Trajectory
 from discrepancy.trials_in_motion.trial_at_rest import LinearTrial, TrialAtRest, trial_at_rest
 from fe.runtime.patch import ModelPatch
@@ -56,13 +57,28 @@ class TrialSet:
         trials = [self.problem.trials[number].trial for number in self.trial_indices]
         return sum(len(trial.time) for trial in trials if trial.is_dynamic)
 
+    @cached_property
+    def _strides(self) -> dict[int, int]:
+        """The stride with which each trial in motion is thinned, by the number of the trial.
+
+        It is found about the prior means, so that trials that are linear about other values have
+        the same stamps.
+        """
+        trials = self.problem.trials
+        in_motion = [number for number in self.trial_indices if trials[number].trial.is_dynamic]
+        if self.sample_limit is None:
+            return dict.fromkeys(in_motion, 1)
+        wanted_stride = self.sample_count / self.sample_limit
+        prior_means = self.problem.prior_mean_point(Candidate())
+        return {
+            number: thinning_stride(ported_trial(self.problem, number, prior_means), wanted_stride)
+            for number in in_motion
+        }
+
     def trials_about(self, point: Point) -> tuple[LinearTrial, ...]:
         """Return the trials with ports, linear about values of the unknowns."""
-        wanted_stride = 1.0
-        if self.sample_limit is not None:
-            wanted_stride = self.sample_count / self.sample_limit
         return tuple(
-            thin_trial(ported_trial(self.problem, number, point), wanted_stride)
+            thin_trial(ported_trial(self.problem, number, point), self._strides[number])
             if self.problem.trials[number].trial.is_dynamic
             else trial_at_rest(self.problem, number, point)
             for number in self.trial_indices

@@ -99,7 +99,7 @@ def ported_trial(problem: Problem, trial_index: int, point: Point) -> PortedTria
     gains = 1.0 + problem.shared.gains(point.shared, trial.channels)
     system, system_derivatives = _ported_system(problem, trial, point.shared)
     system = _with_gains(system, gains)
-    substeps = _substep_count(system, trial.time)
+    substeps = _substep_count(problem, trial)
     # response of the model, about which the missing forces are added
     positions_and_speeds, by_unknowns = _port_motion(problem, trial_index, point, substeps)
     residual, by_shared, by_local = residual_and_derivatives(problem, trial_index, point)
@@ -163,9 +163,8 @@ def thinning_stride(trial: PortedTrial, wanted_stride: float) -> int:
     return max(1, stride - stride % multiple)
 
 
-def thin_trial(trial: PortedTrial, wanted_stride: float) -> PortedTrial:
-    """Return a trial with fewer samples, if it can be thinned; see `thinning_stride`."""
-    stride = thinning_stride(trial, wanted_stride)
+def thin_trial(trial: PortedTrial, stride: int) -> PortedTrial:
+    """Return a trial with every `stride`-th sample, and at least `FEWEST_SUBSTEPS` between two."""
     if stride == 1:
         return trial
     return trial.thinned(stride, max(trial.substeps, FEWEST_SUBSTEPS))
@@ -244,19 +243,23 @@ def _coloured_noises(noises: Sequence[NoiseModel], interval: float | None) -> li
     return [noise_part for noise_part in noise_parts if noise_part is not None]
 
 
-def _substep_count(system: PortedSystem, time: FloatArray) -> int:
-    """Return the number of substeps in an interval between two samples.
+def _substep_count(problem: Problem, trial: Trial) -> int:
+    """Return the number of substeps in an interval between two samples of a trial.
 
     The phase of the fastest mode may change by at most `LARGEST_SUBSTEP_PHASE` in a substep. The
-    number is at most `MOST_SUBSTEPS`, and at least `FEWEST_SUBSTEPS`, or
+    mode is that at the prior means, so that trials that are linear about other values have the same
+    fine stamps. The number is at most `MOST_SUBSTEPS`, and at least `FEWEST_SUBSTEPS`, or
     `FEWEST_SUBSTEPS_OF_LONG_RECORD` for a record of more than `LONG_RECORD` samples.
     """
-    interval = float(np.median(np.diff(time)))
+    prior_means = problem.prior_mean_point(Candidate())
+    parameters = problem.shared.parameters(prior_means.shared)
+    system = problem.model.ported_system(trial, problem.campaign.outputs(trial), parameters)
+    interval = float(np.median(np.diff(trial.time)))
     fastest_angular_frequency = float(
         np.max(np.abs(np.linalg.eigvals(system.generator)), initial=0.0)
     )
     substeps_needed = np.ceil(fastest_angular_frequency * interval / LARGEST_SUBSTEP_PHASE)
-    is_long = len(time) > LONG_RECORD
+    is_long = len(trial.time) > LONG_RECORD
     fewest = FEWEST_SUBSTEPS_OF_LONG_RECORD if is_long else FEWEST_SUBSTEPS
     return int(np.clip(substeps_needed, fewest, MOST_SUBSTEPS))
 

@@ -385,6 +385,29 @@ def test_a_parameter_that_the_force_pushes_to_the_end_of_its_range_comes_back(hi
     assert at_one == pytest.approx(DAMPED.coefficient / DAMPED.reference_velocity**2, rel=0.06)
 
 
+def test_trials_about_other_values_have_the_same_stamps():
+    """A stiffer spring would need five substeps for four: 0.6 rad of its mode pass in an interval."""
+    angular_frequency = np.sqrt(1000.0 / 2.0)
+    parameter = [{"name": "k", "terms": "stiffness", "deviation": 0.1, "low": 0.5, "high": 1.5}]
+    model = one_mass(stiffness=1000.0, damping={"ratios": [0.02]}, parameter=parameter)
+    time = 0.59 / angular_frequency * np.arange(200)
+    trial = Trial.plain(
+        "pushed",
+        TrialKind.FORCED,
+        ("x",),
+        time,
+        values=np.zeros((200, 1)),
+        force=np.sin(time),
+        load_place="push",
+    )
+    channel = Channel("x", Quantity.DISPLACEMENT, "x", NoiseRecord(1e-5, 100.0))
+    problem = problem_of(Campaign("one mass", {"x": channel}, (trial,), None, {}, "0" * 64), model)
+    means = problem.prior_mean_point(Candidate())
+    stiffer = replace(means, shared=means.shared + 2.0)
+    stamps = [ported_trial(problem, 0, point).fine_time for point in (means, stiffer)]
+    np.testing.assert_array_equal(*stamps)
+
+
 @pytest.mark.parametrize("number", [SERVO, STORES])
 def test_a_parameter_turns_what_a_force_does_as_the_system_itself(tmp_path, number):
     """To first order: a heavier body moves less under the same force, and a reaction shows another part."""
