@@ -502,17 +502,6 @@ class Comparison(ABC, Generic[HypothesisT]):
                 return rival
         return None
 
-    def has_more_probable_law(self, curve: HypothesisT) -> bool:
-        """Return whether a single law of what a force of free shape follows is more probable."""
-        pairs = family_place_pairs(curve)
-        for hypothesis in self.ranked_hypotheses:
-            terms = hypothesis.candidate.terms
-            is_law = len(terms) == 1 and terms[0].effect.table is None
-            is_more_probable = self.score(hypothesis) > self.score(curve)
-            if is_law and is_more_probable and pairs & self._curves_of_laws(hypothesis):
-                return True
-        return False
-
     def _is_refuted_by_trials(self, hypothesis: HypothesisT) -> bool:
         """Return whether trials show that a hypothesis does not explain enough of the gap."""
         _, high = self.gap_share(hypothesis, held_out=False).interval

@@ -92,33 +92,22 @@ def outcome_with_hypotheses(
     return VerdictOutcome(complete_verdict, search, fit)
 
 
-def curve_sentence(
-    problem: Problem,
-    effects: Sequence[NamedEffect],
-    probability: float,
-    *,
-    is_law_open: bool = False,
-) -> str:
+def curve_sentence(problem: Problem, effects: Sequence[NamedEffect], probability: float) -> str:
     """Return the sentence on a force of free shape; empty if the effects are something else.
 
     Parameters
     ----------
     effects : sequence of NamedEffect
         The effects of a hypothesis at their most probable values.
-    is_law_open : bool
-        Whether a law of the catalogue may have the shape.
     """
     curve = curve_of(effects)
     if curve is None:
         return ""
     force_unit, _ = problem.model.port_units(curve.port)
-    laws = "no law of the catalogue has its shape"
-    if is_law_open:
-        laws = "these trials do not tell which law of the catalogue it is"
     return (
         f"A {followed_variable_text(effects[0])} is missing at {curve.port} "
-        f"(probability {probability_text(probability)}), and {laws}: "
-        f"{curve_in_words(curve, force_unit)}."
+        f"(probability {probability_text(probability)}), and no law of the catalogue has its "
+        f"shape: {curve_in_words(curve, force_unit)}."
     )
 
 

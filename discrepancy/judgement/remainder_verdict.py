@@ -101,12 +101,7 @@ def named_in_part_outcome(
     share = comparison.held_out_or_fitted_share(best_hypothesis)
     families = {term.effect.family for term in best_hypothesis.candidate.terms if term.free_shape}
     family = ", ".join(sorted(families))
-    sentence = curve_sentence(
-        comparison.problem,
-        effects,
-        probability,
-        is_law_open=comparison.has_more_probable_law(best_hypothesis),
-    )
+    sentence = curve_sentence(comparison.problem, effects, probability)
     if not sentence:
         # effects of the catalogue, and families with a shape of their own
         clauses = []

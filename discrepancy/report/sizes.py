@@ -30,6 +30,8 @@ from fe.runtime.patch import (
 )
 from reporting.words import between, rounded
 
+FLOW_UNIT = "/s times"
+"""Part of the unit of a flow at a port of a state."""
 BESIDE = (
     "reference_velocity",
     "reference_displacement",
@@ -72,7 +74,7 @@ def si_sizes(
             continue  # the page has its points
         if not unit or size.parameter in BESIDE or size.value == 0.0:
             continue
-        verb = _verb(size, primitive)
+        verb = _verb(size, primitive, is_flow=FLOW_UNIT in unit)
         if verb and size.value < 0.0:  # the verb says the sign
             size = replace(size, value=-size.value, low=-size.high, high=-size.low)
         half_width = 0.0
@@ -98,7 +100,7 @@ def si_sizes(
     return ", ".join(sizes)
 
 
-def _verb(interval: PrimitiveInterval, primitive: Primitive) -> str:
+def _verb(interval: PrimitiveInterval, primitive: Primitive, *, is_flow: bool) -> str:
     """Return what a port or channel does by the sign of a number: rubs, softens, stiffens, lags.
 
     Empty if no verb says it. Of a law that grows faster than the displacement, the force is added
@@ -111,7 +113,8 @@ def _verb(interval: PrimitiveInterval, primitive: Primitive) -> str:
         return ""
     if isinstance(primitive, PowerDamping):
         is_dry = primitive.velocity_exponent == primitive.displacement_exponent == 0.0
-        return f"{primitive.port} rubs with" if is_dry else ""
+        verb = "lets through" if is_flow else "rubs with"
+        return f"{primitive.port} {verb}" if is_dry else ""
     if isinstance(primitive, PowerStiffness) and primitive.exponent > 1.0:
         verb = "stiffens by" if interval.value > 0.0 else "softens by"
         return f"{primitive.port} {verb}"

@@ -9,17 +9,17 @@ from discrepancy.judgement.comparison import Comparison
 from fe.runtime.patch import ModelPatch, TableDamping, TableStiffness
 
 
-def hypothesis_of(identifier, *, table=None, family="", score=0.0):
+def hypothesis_of(identifier, *, table=None, family=""):
     term = SimpleNamespace(
         effect=SimpleNamespace(identifier=identifier, table=table, family=family), place="air"
     )
     candidate = SimpleNamespace(terms=(term,), key=identifier)
-    return SimpleNamespace(candidate=candidate, score=score)
+    return SimpleNamespace(candidate=candidate)
 
 
-CURVE = hypothesis_of("curve", table="points", family="force over the velocity", score=-127.0)
-DRAG = hypothesis_of("drag", family="damping", score=-124.0)
-FILTER = hypothesis_of("filter", family="filter", score=-123.0)
+CURVE = hypothesis_of("curve", table="points", family="force over the velocity")
+DRAG = hypothesis_of("drag", family="damping")
+FILTER = hypothesis_of("filter", family="filter")
 
 
 def comparison(*, low=0.95, closed=0.98, trials="held-out", refuted=()):
@@ -29,10 +29,6 @@ def comparison(*, low=0.95, closed=0.98, trials="held-out", refuted=()):
         ranked_hypotheses=[FILTER, DRAG, CURVE],
         gap_share=lambda hypothesis, held_out: SimpleNamespace(is_tested=True, interval=(low, 0.99)),
         errors=lambda hypothesis: SimpleNamespace(closed=SimpleNamespace(trials=trials, value=closed)),
-        score=lambda hypothesis: hypothesis.score,
-        _curves_of_laws=lambda hypothesis: (
-            frozenset({("force over the velocity", "air")}) if hypothesis is DRAG else frozenset()
-        ),
         _is_refuted_by_trials=lambda hypothesis: hypothesis in refuted,
     )
 
@@ -55,10 +51,6 @@ def test_a_name_must_remove_half_of_the_error_of_held_out_trials(reading, has_re
     reason = Comparison.reason_of_remaining_error(comparison(**reading), CURVE)
     assert bool(reason) == has_reason
     assert reason == "" or reason.startswith("a name must remove at least 50 %")
-
-
-def test_a_more_probable_law_of_the_same_variable_is_open():
-    assert Comparison.has_more_probable_law(comparison(), CURVE)
 
 
 def test_the_more_probable_rival_is_one_that_trials_do_not_refute():

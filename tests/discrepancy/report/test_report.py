@@ -442,6 +442,11 @@ def test_without_gauges_there_is_no_planform(strains):
         ("rig", SensorDrift("displacement", 0.002, 10.0), "amplitude 0.002 m"),
         ("rig", SensorDrift("leaf_strain", 0.002, 10.0), ""),
         ("rig", PowerDamping("elsewhere", 0.5, 0.0, 0.0, 1.0, 1.0), "elsewhere rubs with 0.500 N or N m"),
+        (
+            "tank",
+            PowerDamping("outlet", 0.5, 0.0, 0.0, 2.0, 1.0),
+            "outlet lets through 0.500 m/s times capacity",
+        ),
         ("tank", PowerDamping("outlet", 0.5, 0.5, 0.0, 2.0, 1.0), "flow 0.500 m/s times capacity at 2 m"),
         ("tank", patches.Overflow("outlet", 0.5, 1.5, 3.0, 2.0), "flow 0.500 m/s times capacity, level 3 m"),
         ("wing", PowerDamping("root", 0.5, 0.0, 0.0, 1.0, 1.0), "root rubs with 0.500 N m"),
