@@ -295,8 +295,8 @@ class WatchedTopics:
         if waiting == [STEPS - 3, STEPS]:
             (self.north / "wing-2").unlink(missing_ok=True)
             (self.north / "wing-0" / "published").write_text("")
-            for lost in self.fleet._lost.values():
-                lost.again = 0.0
+            for interruption in self.fleet._interruptions.values():
+                interruption.resume_time = 0.0
 
     def publish_logs(self) -> None:
         for number in (0, 2):
