@@ -286,7 +286,7 @@ def test_friction_of_the_cart_is_named_in_the_size_shown_and_not_the_offset(tmp_
     for trial in read_campaign(folder / "my_cart").trials:
         steps = np.diff(trial.time)
         assert 0.015 < np.std(steps) / np.mean(steps) / np.sqrt(2.0) < 0.025
-    told = re.search(r"force ([\d.]+) N \(([\d.]+) to ([\d.]+)\)", text)
+    told = re.search(r"rubs with ([\d.]+) N \(([\d.]+) to ([\d.]+)\)", text)
     value, low, high = (float(number) for number in told.groups())
     found = named(folder, "my_cart")
     assert found == ("coulomb_friction", "rail", pytest.approx(value, abs=0.2 * (high - low)))
