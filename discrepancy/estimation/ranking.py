@@ -92,9 +92,9 @@ def rank_hypotheses(
     """Return estimates of hypotheses, the most probable first.
 
     Effects are added to the best hypothesis one at a time, as long as its score rises. Each time,
-    simpler forms of the best hypothesis are estimated, too. A force of free shape is estimated
-    after the first effect, also if none is more probable than no effect. The ranking ends there if
-    the force of free shape is more probable and leaves no force.
+    its estimate is repeated until it has settled, and its simpler forms are estimated, too. A force
+    of free shape is estimated after the first effect, also if none is more probable than no effect.
+    The ranking ends there if the force of free shape is more probable and leaves no force.
 
     Parameters
     ----------
