@@ -62,7 +62,7 @@ NOTEBOOKS ?= force
 
 .PHONY: docs
 docs: $(DOCS_VENV)/.docs ## Build the site of the documentation into build/docs; a warning is an error (NOTEBOOKS=off: without running them)
-	OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(DOCS_VENV)/bin/python -m sphinx -j 2 -q -W --keep-going -D nb_execution_mode=$(NOTEBOOKS) \
+	PYTHONPATH=$(CURDIR) OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(DOCS_VENV)/bin/python -m sphinx -j 2 -q -W --keep-going -D nb_execution_mode=$(NOTEBOOKS) \
 	  -c docs/site -d build/doctrees docs build/docs
 	@echo "The site is build/docs/index.html."
 

@@ -382,6 +382,15 @@ def published_library() -> Path:
 
 
 @pytest.fixture(scope="session")
+def reference() -> Path:
+    """The authors' calibration folder; skips where it is not at hand."""
+    path = REFERENCE / "uav_experimental_calibration"
+    if not path.is_dir():
+        pytest.skip(f"the authors' calibration folder is not at {path}")
+    return path
+
+
+@pytest.fixture(scope="session")
 def heat_exchanger(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Folder with an FMU of a heat exchanger, its binding and its scenario."""
     source = ROOT / "tests" / "twin_master" / "assets" / "heat_exchanger"

@@ -1,7 +1,6 @@
 """`uav-twin calibrate`: all three steps of a wing; `ringdown`, `simulate` and `campaign`."""
 
 import json as json_text
-from collections.abc import Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import asdict
 from pathlib import Path
@@ -16,7 +15,6 @@ from uav_twin.discrepancy_commands import use_one_thread
 from uav_twin.options import CampaignArgument, DesignOption, SampleSeedOption, complete_model
 
 if TYPE_CHECKING:
-    from calibration.paper.figures import TableRow
     from calibration.result.record import Calibration
     from calibration.virtual_wing import TestBench
     from fe.runtime.state import DigitalState
@@ -85,7 +83,6 @@ def print_calibration(
     *,
     json: bool,
     report: bool,
-    table_1: "Sequence[TableRow]" = (),
 ) -> None:
     """Print the posterior of a calibration, and the files that were written.
 
@@ -95,17 +92,14 @@ def print_calibration(
         The file of the calibration, if one was written.
     report : bool
         Whether a report was written beside the file.
-    table_1 : sequence of TableRow
-        Table 1 of the paper with the values of a wing; empty for other models.
     """
     if json:
         file = None if written_file is None else str(written_file)
         terminal.print_json({"calibration": file} | _calibration_record(result))
         return
-    from calibration.paper.figures import printed_table_1
     from calibration.result.text import printed_calibration
 
-    terminal.show(printed_calibration(result, [printed_table_1(table_1)]))
+    terminal.show(printed_calibration(result))
     if written_file is None:
         terminal.say("Nothing was written: give --out DIR for calibration.nc and the report.")
         return
@@ -165,20 +159,13 @@ def calibrate_wing(
     ] = None,
     out: Annotated[
         Path | None,
-        typer.Option("--out", help="Folder for calibration.nc, report, table and figures."),
+        typer.Option("--out", help="Folder for calibration.nc, report and figures."),
     ] = None,
     seed: SampleSeedOption = 0,
     asset: Annotated[
         str | None,
         typer.Option("--asset", show_default="that of the design", help="Name of this wing."),
     ] = None,
-    procedure: Annotated[
-        Literal["joint", "paper"],
-        typer.Option(
-            "--procedure",
-            help="Keep samples of the joint posterior, or of the paper's steps one after another.",
-        ),
-    ] = "joint",
     design: Annotated[
         Path | None,
         typer.Option("--design", help="The wing as drawn; the shipped design by default."),
@@ -234,17 +221,11 @@ def calibrate_wing(
     if not json:
         for origin in lab.origins:
             terminal.say(f"Step {origin.step}: {origin.text}.")
-    calibration = calibrate(lab, wing_design, asset=name, procedure=procedure, seed=seed)
+    calibration = calibrate(lab, wing_design, asset=name, seed=seed)
     written_file = None
     if out is not None:
         written_file = write_wing_folder(calibration, out, report=not no_report)
-    print_calibration(
-        calibration.result,
-        written_file,
-        json=json,
-        report=not no_report,
-        table_1=calibration.table_1,
-    )
+    print_calibration(calibration.result, written_file, json=json, report=not no_report)
 
 
 def calibrate_ringdown(

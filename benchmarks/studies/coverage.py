@@ -23,12 +23,12 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 
+from benchmarks.studies.paper.masses import fit_masses
 from calibration.dynamics.trials import fit_trials
 from calibration.errors import CalibrationError, ExperimentDataError
 from calibration.joint.measured_modes import measured_modes
 from calibration.joint.posterior import joint_posterior
 from calibration.joint.wing_table import MODEL_ERROR, WingTable, tabulate_wing, wing_priors
-from calibration.paper.procedure import fit_masses
 from calibration.result.record import STATE, QuantityReading, prior_samples
 from calibration.static.errors_in_variables import exact_posterior
 from calibration.static.experiments import LoadDisplacementData

@@ -25,10 +25,10 @@ from reporting.words import brief, comma_list, plus_minus
 if TYPE_CHECKING:  # it takes long to import
     from matplotlib.axes import Axes
 
-Procedure = Literal["quadrature", "Gaussian", "several optima", "joint", "paper"]
+Procedure = Literal["quadrature", "Gaussian", "several optima", "joint"]
 """How the samples were drawn: by quadrature of one parameter and the others given it, from the
 Gaussian at the optimum where the posterior is one, or from Gaussians at several optima; for a wing
-by importance sampling, or by the paper's procedure."""
+by importance sampling."""
 
 FROM_LABORATORY = "from the laboratory of a wing (`uav-twin calibrate`)"
 FROM_CAMPAIGN = "from a campaign (`uav-twin calibrate campaign`)"

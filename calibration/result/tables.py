@@ -25,7 +25,6 @@ PROCEDURES = {
     "Gaussian": "a Gaussian, checked along its axes",
     "several optima": "several optima, each a Gaussian",
     "joint": "of all experiments together, by importance sampling",
-    "paper": "by the paper's procedure, step after step",
 }
 
 

@@ -1,6 +1,6 @@
 """A calibration in words, for console and page."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 
 import numpy as np
 
@@ -59,14 +59,11 @@ def outcome_sentences(result: Calibration) -> str:
     return f"{narrowed} {agreement}"
 
 
-def printed_calibration(
-    result: Calibration, further_tables: Iterable[Table] = ()
-) -> Iterator[str | Table]:
+def printed_calibration(result: Calibration) -> Iterator[str | Table]:
     """Yield the printed lines and tables of a calibration: first the outcome, then the tables."""
     yield headline(result)
     for finding in result.findings:
         yield f"- {finding}"
-    yield from further_tables
     yield tables.parameters_table(result)
     yield from correlation_lines(result)
     yield tables.readings_table(result)

@@ -236,3 +236,14 @@ def stiffness_curve_of(
             f"for a polynomial: the relative error is {error:.1g} at degree {_DEGREE}."
         )
     return StiffnessCurve(polynomial, name)
+
+
+def push_forward(posterior: ScalarPosterior, curve: StiffnessCurve) -> ScalarPosterior:
+    """Return the density of the stiffness k(e), given that of e: p(k) = p(e) / (dk/de).
+
+    Values of e for which the stiffness is not positive are left out.
+    """
+    stiffness = curve.stiffness(posterior.grid)
+    is_positive = stiffness > 0.0
+    density = posterior.density[is_positive] / curve.slope(posterior.grid[is_positive])
+    return ScalarPosterior(stiffness[is_positive], density)

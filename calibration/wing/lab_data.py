@@ -22,7 +22,6 @@ from calibration.geometry import (
 from calibration.joint.measured_modes import PUBLISHED_MODES, measured_modes
 from calibration.joint.wing_table import weighed_mass
 from calibration.lab_folder import find_in_lab_folder, lab_table
-from calibration.paper.procedure import RESULTS_FILE, PaperSamples, read_published_results
 from calibration.result.record import QuantityReading
 from calibration.static.experiments import (
     MEASUREMENTS_FILE,
@@ -195,7 +194,6 @@ class LabData:
     origins: tuple[StepOrigin, ...]
     input_hashes: dict[str, str]
     trials: Fits | None = None
-    authors: PaperSamples | None = None
 
 
 def published_data() -> LabData:
@@ -272,9 +270,6 @@ def read_lab_folder(
     mass_file = find_in_lab_folder(path, WEIGHED_MASS_FILE)
     if mass_file is not None:
         lab = _with_weighed_mass(lab, mass_file)
-    results_file = find_in_lab_folder(path, STEP_FOLDER / RESULTS_FILE)
-    if results_file is not None:
-        lab = replace(lab, authors=read_published_results(results_file))
     return lab
 
 

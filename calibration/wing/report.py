@@ -1,8 +1,7 @@
-"""The folder of a calibrated wing: page, figures, Table 1, and the wing for ParaView."""
+"""The folder of a calibrated wing: page, figures, and the wing for ParaView."""
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Protocol
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -11,9 +10,6 @@ from matplotlib.tri import Triangulation
 from numpy.typing import NDArray
 
 from calibration.dynamics.figures import ring_down_figure
-from calibration.paper.figures import calibration_figure, printed_table_1, write_table_1
-from calibration.paper.load_test import StaticCalibration, push_forward
-from calibration.result.figures import corner_figure, unmeasured_parameters
 from calibration.result.file import FILE_NAME
 from calibration.result.folder import (
     FIGURES,
@@ -22,6 +18,9 @@ from calibration.result.folder import (
     calibration_folder,
     write_page,
 )
+from calibration.static.figure import load_test_figure
+from calibration.static.load_test import StaticCalibration
+from calibration.static.posterior import ScalarPosterior, push_forward
 from calibration.wing.calibrate import WingCalibration
 from calibration.wing.lab_data import StepOrigin
 from fe.reduction.model_cache import WingFields, wing_fields, write_modes_vtu, write_wing_vtu
@@ -42,14 +41,13 @@ LOAD_FACTOR = 3.0
 _CHORD_TO_THE_LEFT = 0.45
 _CHORD_DOWNWARD = 0.40
 """Shifts of a point in the oblique view of a wing, per unit of its chordwise position."""
-TABLE_NAME = "table_1.csv"
 
 
 def write_wing_folder(calibration: WingCalibration, folder: Path, *, report: bool = True) -> Path:
     """Write a calibrated wing to a folder, and return the path of its file `calibration.nc`.
 
-    The folder also has Table 1 of the paper as computed here and, if `report` is true, a page with
-    figures, and the wing and its modes as files for ParaView.
+    If `report` is true, the folder also has a page with figures, and the wing and its modes as
+    files for ParaView.
 
     Raises
     ------
@@ -59,7 +57,6 @@ def write_wing_folder(calibration: WingCalibration, folder: Path, *, report: boo
     result = calibration.result
     fields = wing_fields(result.design) if report else None
     with calibration_folder(result, folder) as new_folder:
-        write_table_1(calibration.table_1, new_folder / TABLE_NAME)
         if fields is not None:
             state = result.mean_state()
             model_vector = fields.model.vector(
@@ -87,7 +84,7 @@ def _wing_sections(calibration: WingCalibration, fields: WingFields, folder: Pat
     mode_figure = WORDS.figure("modes", modes_figure(fields, modes, _mode_titles(modes)))
     return [
         Section("What was measured", _origins(calibration.lab.origins)),
-        Section("Beside the paper", _comparison_with_paper(calibration, folder)),
+        Section("Load test", _load_test(calibration.static, folder)),
         Section("Ring-down", [ring_down]),
         Section("The calibrated wing", [save_figure(mode_figure, folder)]),
     ]
@@ -106,59 +103,19 @@ def _origins(origins: Sequence[StepOrigin]) -> list[Block]:
     return blocks
 
 
-def _comparison_with_paper(calibration: WingCalibration, folder: Path) -> list[Block]:
-    """Return the page's parts on Table 1, the load test, and the posteriors beside the paper's.
-
-    The figures are written to `folder`.
-    """
-    load_test = WORDS.figure("load_test", calibration_figure(calibration.static))
-    rows = [
-        *_posterior_rows("tailored model", calibration.static),
-        *_posterior_rows("line of the paper, eq. (14)", calibration.static_published),
-    ]
-    columns, names = unmeasured_parameters(calibration.joint)
-    sample_sets = [
-        ("joint posterior", calibration.joint.samples[:, columns]),
-        ("the paper's procedure", calibration.paper.samples[:, columns]),
-    ]
-    authors = calibration.lab.authors
-    remark = ""
-    if authors is not None:
-        sample_sets.append(("authors' model", authors.samples))
-        remark = "; grey are the authors’ published samples"
-    procedure = WORDS.figure("procedure", corner_figure(names, sample_sets), authors=remark)
-    return [
-        printed_table_1(calibration.table_1),
-        save_figure(load_test, folder),
-        WORDS.table("two_models", rows),
-        save_figure(procedure, folder),
-    ]
-
-
-def _posterior_rows(model: str, static: StaticCalibration) -> list[tuple[str, str, str, str]]:
-    """Return the table rows of a load test: model, posterior, e and tip stiffness."""
+def _load_test(static: StaticCalibration, folder: Path) -> list[Block]:
+    """Return the page's figure and table of the load test; the figure is written to `folder`."""
     posteriors = {"exact": static.exact}
     for name, alternative in static.alternatives.items():
         posteriors[f"exact, {name}"] = alternative
     rows = []
-    for name, e in posteriors.items():
-        rows.append((model, name, _moments(e), _moments(push_forward(e, static.curve))))
-    particle = static.particle
-    rows.append((model, "particle filter", _moments(particle), _moments(particle.stiffness)))
-    return rows
+    for name, factor in posteriors.items():
+        rows.append((name, _moments(factor), _moments(push_forward(factor, static.curve))))
+    figure = WORDS.figure("load_test", load_test_figure(static))
+    return [save_figure(figure, folder), WORDS.table("load_test", rows)]
 
 
-class _HasMoments(Protocol):
-    """A density with mean and standard deviation."""
-
-    @property
-    def mean(self) -> float: ...
-
-    @property
-    def standard_deviation(self) -> float: ...
-
-
-def _moments(density: _HasMoments) -> str:
+def _moments(density: ScalarPosterior) -> str:
     """Format the mean and the standard deviation of a density."""
     return plus_minus(density.mean, density.standard_deviation)
 

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.errors import ExperimentDataError, ExperimentFileError
-from calibration.paper.procedure import RESULTS_FILE, read_published_results
+from evidence.identification.published_results import RESULTS_FILE, read_published_results
 from twin_master.assets.strain_library_source import FILE_NAME, StrainLibrary, load_strain_library
 
 FloatArray = NDArray[np.float64]
@@ -182,7 +182,7 @@ def read_targets(data: Path | str) -> Targets:
     healthy_draws = library.strain_per_draw[:, NO_LOSS, control]
 
     published = read_published_results(results_file)
-    factor, servo, pitot = published.samples.T[:3]
+    factor, servo, pitot = published.states.T
     fitted_row = np.arange(len(servo)) % 2 == 0
     if fitted_row.sum() < MODAL_TERMS + 1:
         raise ExperimentDataError(

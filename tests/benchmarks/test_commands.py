@@ -37,14 +37,19 @@ def test_a_command_answers_help(name, monkeypatch, capsys):
 def studies() -> list[Path]:
     """Return the files of the studies that are commands."""
     folder = Path(benchmarks.studies.__file__).parent
-    return [file for file in sorted(folder.glob("*.py")) if "__main__" in file.read_text(encoding="utf-8")]
+    return [file for file in sorted(folder.rglob("*.py")) if "__main__" in file.read_text(encoding="utf-8")]
 
 
-@pytest.mark.parametrize("file", studies(), ids=lambda file: file.stem)
+def command_name(file: Path) -> str:
+    """Return the name of a study: that of its file, or of its folder."""
+    return file.parent.name if file.stem == "__main__" else file.stem
+
+
+@pytest.mark.parametrize("file", studies(), ids=command_name)
 def test_a_study_names_the_page_of_its_figures_and_the_page_names_its_command(file):
     docstring = ast.get_docstring(ast.parse(file.read_text(encoding="utf-8")))
     assert docstring is not None
     pages = re.findall(r"docs/[\w/]+\.md", docstring)
     assert pages
     for page in pages:
-        assert f"python -m benchmarks.studies.{file.stem}" in (ROOT / page).read_text(encoding="utf-8")
+        assert f"python -m benchmarks.studies.{command_name(file)}" in (ROOT / page).read_text(encoding="utf-8")

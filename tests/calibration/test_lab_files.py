@@ -17,7 +17,6 @@ from calibration.geometry import (
     tailored_geometry,
 )
 from calibration.joint.wing_table import weighed_mass
-from calibration.paper.procedure import read_published_results
 from calibration.static.experiments import published_measurements, read_measurements
 from calibration.virtual_wing import measure_lengths, measure_load_test, measure_ring_down
 from calibration.wing.lab_data import (
@@ -26,6 +25,7 @@ from calibration.wing.lab_data import (
     read_weighed_mass,
     write_lab_folder,
 )
+from evidence.identification.published_results import read_published_results
 from fe.runtime.errors import InvalidDesignError
 from fe.runtime.state import Geometry
 from fe.wing.design import load_design
@@ -158,17 +158,6 @@ def test_ring_downs_of_the_authors_are_left_aside_if_asked(authors_folder):
     assert [origin.read for origin in authors_folder.origins] == [True, True, False]
     assert "ignored as requested" in authors_folder.origins[2].text
     assert authors_folder.trials is None
-
-
-def test_samples_of_the_authors_have_the_published_moments(authors_folder):
-    samples = authors_folder.authors.samples
-    _, servo_mean, pitot_mean, alpha_mean, beta_mean = samples.mean(axis=0)
-    _, servo_deviation, pitot_deviation, _, _ = samples.std(axis=0, ddof=1)
-
-    assert len(samples) == 100
-    moments = (servo_mean, pitot_mean, servo_deviation, pitot_deviation)
-    assert moments == pytest.approx((0.1691, 0.1337, 0.0039, 0.0077), abs=5e-5)
-    assert (alpha_mean, beta_mean) == pytest.approx((1.030, 7.66e-4), rel=7e-4)
 
 
 @pytest.fixture(scope="module")

@@ -142,7 +142,7 @@ def test_the_master_script_is_the_same_command(tmp_path):
 
 
 FLIGHT = (  # `run --no-report`
-    "twin_master.workflow, twin_master.assets.design_source, calibration.paper.load_test, "
+    "twin_master.workflow, twin_master.assets.design_source, calibration.static.load_test, "
     "calibration.static.errors_in_variables, calibration.static.experiments, calibration.static.posterior"
 )
 
@@ -449,7 +449,7 @@ def shown_records(library_file: Path) -> list[tuple[object, tuple[str, ...]]]:
         (Investigation(campaign, model, (), verdict), ("Verdict(", model.name)),
         (StoredVerdict(verdict, None, Origin("A rig", "A model", *[""] * 3, {})), ("Verdict(", "A rig")),
         (wing, (wing.asset, "samples=40")),
-        (WingCalibration(wing, wing, "joint", *[None] * 4), ("Calibration(", "joint")),  # type: ignore[arg-type]
+        (WingCalibration(wing, *[None] * 3), ("Calibration(", "joint")),  # type: ignore[arg-type]
         (uav_twin.load_scenario("level_turns"), ("level_turns.toml",)),
         (knowledge, ("level_turns", "GraphicalModel(", "GaussianSensorModel(")),
         (knowledge.model, ("states=", "controls=2 (2g, 3g)")),

@@ -164,10 +164,14 @@ def _draws_of_load_test(
     published straight line if the model is None.
     """
     # These modules take a while to load, and a scenario can be read without them.
-    from calibration.paper.load_test import particle_filter, push_forward
     from calibration.static.errors_in_variables import exact_posterior
     from calibration.static.experiments import published_measurements
-    from calibration.static.posterior import PUBLISHED_LINE, GaussianPrior, stiffness_curve_of
+    from calibration.static.posterior import (
+        PUBLISHED_LINE,
+        GaussianPrior,
+        push_forward,
+        stiffness_curve_of,
+    )
     from reporting.json_file import plain
 
     seeds = seed_sequence(seed, "calibration")
@@ -176,11 +180,7 @@ def _draws_of_load_test(
     if model is not None:
         validity = model.validity["young_modulus_factor"]
         curve = stiffness_curve_of(model.tip_stiffness, validity)
-    if calibration.method == "exact":
-        posterior = exact_posterior(measurements, curve=curve)
-    else:
-        filter_seed = int(seeds.generate_state(1)[0])
-        posterior = particle_filter(measurements, seed=filter_seed, curve=curve)
+    posterior = exact_posterior(measurements, curve=curve)
     # The distribution of the tip stiffness that follows from that of the factor, for the record.
     stiffness = push_forward(posterior, curve)
     return ParameterDraws(
@@ -188,7 +188,7 @@ def _draws_of_load_test(
         values=posterior.samples(seeds, calibration.draws),
         mean=posterior.mean,
         standard_deviation=posterior.standard_deviation,
-        source=f"static test of the wing, {calibration.method.replace('_', ' ')}, {curve.name}",
+        source=f"static test of the wing, exact, {curve.name}",
         record={
             "parameter": calibration.parameter,
             "prior": plain(GaussianPrior()),

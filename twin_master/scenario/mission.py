@@ -110,8 +110,6 @@ class Calibration(FileSection):
     file: str | None = None
     """A calibration (`calibration.nc`). If `mean` and `standard_deviation` are given, the file is
     used for everything else in it."""
-    method: Literal["particle_filter", "exact"] = "exact"
-    """How the posterior of the static test is computed."""
     curve: Literal["published", "design"] = "published"
     """Stiffness curve of the static test: as published, or computed from the design."""
     draws: Count = 100

@@ -262,4 +262,17 @@ def parse_scenario(table: Mapping[str, object], source: str) -> Scenario:
     if is_format_1 and "belief" not in table:
         table = from_format_1(table)
     table = with_present_names(table, PRESENT_NAMES, source, ScenarioError)
+    table = _without_method(table)
     return validate(Scenario, table, source, ScenarioError, what="a scenario")
+
+
+def _without_method(table: Mapping[str, object]) -> Mapping[str, object]:
+    """Return a scenario without `calibration.method = "exact"`, a key of former versions.
+
+    The static test is always evaluated exactly now. The schema refuses any other value of the key.
+    """
+    calibration = table.get("calibration")
+    if not isinstance(calibration, Mapping) or calibration.get("method") != "exact":
+        return table
+    remaining_keys = {key: value for key, value in calibration.items() if key != "method"}
+    return {**table, "calibration": remaining_keys}

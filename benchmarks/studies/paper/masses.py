@@ -6,22 +6,17 @@ the two modes their measured damping ratios by eq. (18).
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 from scipy.optimize import minimize_scalar
 
-from calibration.dynamics.records import STEP_FOLDER
 from calibration.errors import ExperimentDataError
 from calibration.joint.posterior import servo_range
-from calibration.lab_folder import lab_table
 from calibration.result.record import QuantityReading
+from evidence.identification.published_results import PublishedResults
 from fe.runtime.modal_system import rayleigh_coefficients
 from reporting.arrays import Float
-
-RESULTS_FILE = "massoptimizationresults.csv"
-"""The authors' masses and frequencies for each of their samples of e."""
 
 _AT_LIMIT = 1e-6  # kg between a mass and the end of its range
 
@@ -149,33 +144,11 @@ def damping_coefficients(
     return alpha, beta
 
 
-def read_published_results(path: Path) -> PaperSamples:
-    """Read the authors' masses and frequencies, with alpha and beta by eq. (25).
-
-    Parameters
-    ----------
-    path : Path
-        The authors' calibration folder, or `massoptimizationresults.csv` itself.
-
-    Raises
-    ------
-    ExperimentFileError
-        If the file is missing, empty, lacks a column, or has a cell that is not a number.
-    ExperimentDataError
-        If a value is not positive and finite.
-    """
-    table = lab_table(path, STEP_FOLDER / RESULTS_FILE)
-
-    def column(name: str) -> Float:
-        return table.numbers(name, "the authors' step 3", positive=True)
-
-    states = np.column_stack([column("e_sample"), column("mass_servo_1"), column("mass_pitot")])
-    frequencies = np.column_stack([column("freq_1"), column("freq_2")])
-    # All rows have the same measured ratios.
-    ratios = float(column("zeta_1")[0]), float(column("zeta_2")[0])
-    for target in ("target_freq_1", "target_freq_2"):
-        column(target)  # not used, but must hold positive numbers
+def authors_samples(published: PublishedResults) -> PaperSamples:
+    """Return the authors' samples, with alpha and beta by eq. (25)."""
+    ratio_1, ratio_2 = published.damping_ratio.tolist()
     damping = []
-    for frequency_1, frequency_2 in frequencies.tolist():
-        damping.append(damping_coefficients((frequency_1, frequency_2), ratios))
-    return PaperSamples(np.column_stack([states, damping]), frequencies)
+    for frequency_1, frequency_2 in published.frequency.tolist():
+        damping.append(damping_coefficients((frequency_1, frequency_2), (ratio_1, ratio_2)))
+    samples = np.column_stack([published.states, damping])
+    return PaperSamples(samples, published.frequency)

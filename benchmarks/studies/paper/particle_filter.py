@@ -1,16 +1,14 @@
-"""Calibration step 2, as in Fig. 5 of the paper: e and tip stiffness, exactly and by particles."""
+"""The particle filter of the paper, for the factor e on Young's modulus and the tip stiffness."""
 
 import math
 from collections.abc import Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
-from calibration.errors import OutsideValidityError, PosteriorError
-from calibration.static.errors_in_variables import FitQuality, Measure, assess_fit, exact_posterior
-from calibration.static.experiments import LoadDisplacementData, published_measurements
+from calibration.errors import PosteriorError
+from calibration.static.experiments import LoadDisplacementData
 from calibration.static.posterior import (
     PUBLISHED_LINE,
     GaussianPrior,
@@ -18,6 +16,7 @@ from calibration.static.posterior import (
     Seed,
     StiffnessCurve,
     child_seed,
+    push_forward,
 )
 from reporting.arrays import Float
 
@@ -35,8 +34,7 @@ _MEDIAN_DEVIATION_OF_GAUSSIAN = 0.6745  # of a standard Gaussian, as rounded in 
 _PURPOSE_PAIRS = 0  # of the seed
 _PURPOSE_PARTICLES = 1  # of the seed
 _FEWEST_EFFECTIVE_PARTICLES = 10.0
-_LIKELIHOOD_REACH = 8.0  # of the grid of likelihoods, in prior standard deviations
-_LIKELIHOOD_GRID_SIZE = 801
+_LIKELIHOOD_REACH = 8.0  # of the likelihoods, in prior standard deviations
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -48,16 +46,10 @@ class ParticlePosterior(ScalarPosterior):
 
     Attributes
     ----------
-    likelihood_grid : (N,) array
-        The values of e at which the likelihoods are stored.
-    likelihood : (n_pairs, N) array
-        The kernel density of e from each pair alone: the paper's likelihood curves in Fig. 5.
     stiffness : ScalarPosterior
         The density of the particles' tip stiffness k(e) [N/m].
     """
 
-    likelihood_grid: Float
-    likelihood: Float
     stiffness: ScalarPosterior
 
 
@@ -158,9 +150,8 @@ def particle_filter(
     generator = np.random.default_rng(child_seed(seed, _PURPOSE_PARTICLES))
     pair_generator = np.random.default_rng(child_seed(seed, _PURPOSE_PAIRS))
     particles = prior.mean + prior.standard_deviation * generator.standard_normal(particle_count)
-    standardised_grid = np.linspace(-_LIKELIHOOD_REACH, _LIKELIHOOD_REACH, _LIKELIHOOD_GRID_SIZE)
-    likelihood_grid = prior.mean + prior.standard_deviation * standardised_grid
-    window = float(likelihood_grid[0]), float(likelihood_grid[-1])
+    reach = _LIKELIHOOD_REACH * prior.standard_deviation
+    window = prior.mean - reach, prior.mean + reach
 
     pair_densities = []
     for pair in range(data.count):
@@ -190,8 +181,6 @@ def particle_filter(
         density=coarse_density.density,
         mean=moments_of_e.mean,
         standard_deviation=moments_of_e.standard_deviation,
-        likelihood_grid=likelihood_grid,
-        likelihood=np.array([density.at(likelihood_grid) for density in pair_densities]),
         stiffness=ScalarPosterior(
             stiffness_density.grid,
             stiffness_density.density,
@@ -261,116 +250,3 @@ def _weighted_moments(weight: Float, value: Float) -> Moments:
     mean = float(np.sum(weight * value))
     variance = float(np.sum(weight * (value - mean) ** 2))
     return Moments(mean, math.sqrt(variance))
-
-
-@dataclass(frozen=True, eq=False)
-class StaticCalibration:
-    """All results of calibration step 2.
-
-    Attributes
-    ----------
-    prior : GaussianPrior
-        The prior p(e).
-    particle : ParticlePosterior
-        The posterior p(e | pairs) by the paper's particle filter.
-    exact : ScalarPosterior
-        The posterior p(e | pairs) with errors in both variables, by quadrature.
-    alternatives : dict of str to ScalarPosterior
-        The exact posterior under other assumptions, unless it leaves the range of the curve.
-    """
-
-    data: LoadDisplacementData
-    curve: StiffnessCurve
-    prior: GaussianPrior
-    particle: ParticlePosterior
-    exact: ScalarPosterior
-    alternatives: dict[str, ScalarPosterior]
-
-    @property
-    def before(self) -> ScalarPosterior:
-        """The prior of e as a density on a grid."""
-        grid = np.linspace(-8.0, 8.0, 2001) * self.prior.standard_deviation + self.prior.mean
-        return ScalarPosterior(grid, np.exp(self.prior.log_density(grid)))
-
-    @property
-    def tip_stiffness_prior(self) -> ScalarPosterior:
-        """p(k), the quantity of interest of Fig. 5 [N/m]."""
-        return push_forward(self.before, self.curve)
-
-    @property
-    def tip_stiffness_exact(self) -> ScalarPosterior:
-        """p(k | pairs) by quadrature [N/m]."""
-        return push_forward(self.exact, self.curve)
-
-    @property
-    def quality(self) -> FitQuality:
-        """Residuals at the exact posterior mean."""
-        return assess_fit(self.data, float(self.curve.stiffness(self.exact.mean)))
-
-
-def calibrate_static(
-    curve: StiffnessCurve = PUBLISHED_LINE,
-    data: LoadDisplacementData | None = None,
-    seed: int = 0,
-    *,
-    particle_count: int = DEFAULT_PARTICLE_COUNT,
-) -> StaticCalibration:
-    """Return the posterior of e by quadrature and by particle filter, and under other assumptions.
-
-    Parameters
-    ----------
-    curve : StiffnessCurve
-        The stiffness k(e): the published line by default, `stiffness_curve_of` of a structural
-        model.
-    data : LoadDisplacementData, optional
-        The measured pairs; the eight published ones by default.
-    particle_count : int
-        The number of particles of the filter.
-
-    Raises
-    ------
-    OutsideValidityError, PosteriorError
-        See `exact_posterior` and `particle_filter`.
-    """
-    if data is None:
-        data = published_measurements()
-    prior = GaussianPrior()
-    exact = exact_posterior(data, curve=curve, prior=prior)
-    particle = particle_filter(
-        data, seed=seed, curve=curve, prior=prior, particle_count=particle_count
-    )
-    alternatives = {}
-    # Name, measure, and standard deviation of the zero offset that each loading run shares
-    assumptions: tuple[tuple[str, Measure, float], ...] = (
-        ("flat in load", "load", 0.0),
-        ("ratio", "ratio", 0.0),  # the limit of the particle filter
-        ("zero offsets", "displacement", data.displacement_standard_deviation),
-    )
-    for name, measure, offset in assumptions:
-        with suppress(OutsideValidityError):
-            alternatives[name] = exact_posterior(
-                data,
-                curve=curve,
-                prior=prior,
-                measure=measure,
-                zero_offset_standard_deviation=offset,
-            )
-    return StaticCalibration(
-        data=data,
-        curve=curve,
-        prior=prior,
-        particle=particle,
-        exact=exact,
-        alternatives=alternatives,
-    )
-
-
-def push_forward(posterior: ScalarPosterior, curve: StiffnessCurve) -> ScalarPosterior:
-    """Return the density of the stiffness k(e), given that of e: p(k) = p(e) / (dk/de).
-
-    Values of e for which the stiffness is not positive are left out.
-    """
-    stiffness = curve.stiffness(posterior.grid)
-    is_positive = stiffness > 0.0
-    density = posterior.density[is_positive] / curve.slope(posterior.grid[is_positive])
-    return ScalarPosterior(stiffness[is_positive], density)
