@@ -52,4 +52,6 @@ def test_a_study_names_the_page_of_its_figures_and_the_page_names_its_command(fi
     pages = re.findall(r"docs/[\w/]+\.md", docstring)
     assert pages
     for page in pages:
-        assert f"python -m benchmarks.studies.{command_name(file)}" in (ROOT / page).read_text(encoding="utf-8")
+        assert f"python -m benchmarks.studies.{command_name(file)}" in (ROOT / page).read_text(
+            encoding="utf-8"
+        )

@@ -468,3 +468,13 @@ def test_a_control_that_several_tables_lack_is_told_of_all():
     found = missing_in(table)
     assert "`rewards.control` must have one entry for each control (2g, 3g), and has 3g" in found
     assert "`transition.probability` must have one entry for each control (2g, 3g), and has 3g" in found
+
+
+def test_the_former_method_of_the_static_test_is_read_where_it_is_exact():
+    table = load_scenario("level_turns").scenario.to_dict()
+    present = parse_scenario(table, "x.toml")
+    table["calibration"]["method"] = "exact"
+    assert parse_scenario(table, "x.toml") == present
+    table["calibration"]["method"] = "particle_filter"
+    with pytest.raises(ScenarioError, match="method"):
+        parse_scenario(table, "x.toml")
