@@ -449,7 +449,7 @@ def shown_records(library_file: Path) -> list[tuple[object, tuple[str, ...]]]:
         (Investigation(campaign, model, (), verdict), ("Verdict(", model.name)),
         (StoredVerdict(verdict, None, Origin("A rig", "A model", *[""] * 3, {})), ("Verdict(", "A rig")),
         (wing, (wing.asset, "samples=40")),
-        (WingCalibration(wing, *[None] * 3), ("Calibration(", "joint")),  # type: ignore[arg-type]
+        (WingCalibration(wing, *[None] * 3), ("Calibration(", wing.asset)),  # type: ignore[arg-type]
         (uav_twin.load_scenario("level_turns"), ("level_turns.toml",)),
         (knowledge, ("level_turns", "GraphicalModel(", "GaussianSensorModel(")),
         (knowledge.model, ("states=", "controls=2 (2g, 3g)")),
