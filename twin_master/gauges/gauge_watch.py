@@ -34,7 +34,7 @@ from twin_master.gauges.fault_kernels import Observations
 from twin_master.gauges.hypothesis_weights import log_of_sum, log_of_sums
 from twin_master.gauges.notices import NoticeWriter
 from twin_master.gauges.stuck_gauges import StandstillTest, StuckGauges
-from twin_master.gauges.watch_state import MODEL_KEY, StoredBelief, WatchState
+from twin_master.gauges.watch_state import MODEL_KEY, PREFIX, StoredBelief, WatchState
 from twin_master.network.estimator import (
     Carried,
     Estimate,
@@ -445,6 +445,15 @@ class WatchfulEstimator:
         return np.asarray(
             last_step.model_weight * under_model + (1.0 - last_step.model_weight) * competing
         )
+
+    def for_smoothing(self, carried: Carried) -> Carried:
+        """Return the arrays of a step that smoothing needs: the beliefs of the faults are not."""
+        arrays = {
+            name: array
+            for name, array in carried.arrays.items()
+            if name in StoredBelief.NAMES or not name.startswith(PREFIX)
+        }
+        return Carried(carried.control_index, arrays)
 
     def step(
         self, before: Carried | None, observation: Float, control_index: int, step: int

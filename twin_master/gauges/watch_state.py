@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -168,6 +168,7 @@ class WatchState:
         gauge_belief = np.ascontiguousarray(gauge_belief)
         # The comparison first makes `flatnonzero` ten times as fast.
         nonzero_indices = np.flatnonzero(gauge_belief != 0.0)
+        smallest_type = np.min_scalar_type(gauge_belief.size)
         sensors = beliefs.model_squares.shape[1]
         by_fault = (sensors, -1)
         sums = np.stack([beliefs.gauge_sum_cc[0], beliefs.gauge_sum_cx[0]], axis=-1)
@@ -176,7 +177,7 @@ class WatchState:
             "model": _by_draw(beliefs.model, states),
             "mended": _by_draw(beliefs.recovered, states),
             "gauge": gauge_belief.ravel()[nonzero_indices],
-            "gauge_place": nonzero_indices.astype(np.int32),
+            "gauge_place": nonzero_indices.astype(smallest_type),
             "none": _by_draw(beliefs.free_gains, states)[None],
             "share": self.weights.current[0],
             "hidden": self.weights.hidden[0],
@@ -296,6 +297,9 @@ class StoredBelief:
         The weight of the model.
     """
 
+    NAMES: ClassVar = (f"{PREFIX}belief", f"{PREFIX}rivals", f"{PREFIX}right")
+    """The names of the arrays from which the beliefs are read."""
+
     belief: Float
     competing_belief: Float
     model_weight: float
@@ -303,8 +307,7 @@ class StoredBelief:
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, NDArray[np.generic]]) -> "StoredBelief":
         """Return the beliefs among the arrays that an estimator carried on."""
+        belief, competing_belief, model_weight = (np.asarray(arrays[name]) for name in cls.NAMES)
         return cls(
-            np.asarray(arrays[f"{PREFIX}belief"], dtype=np.float64),
-            np.asarray(arrays[f"{PREFIX}rivals"], dtype=np.float64),
-            float(np.asarray(arrays[f"{PREFIX}right"])[0]),
+            belief.astype(np.float64), competing_belief.astype(np.float64), float(model_weight[0])
         )

@@ -231,7 +231,12 @@ class Estimate:
 
 
 class Estimator(Protocol):
-    """The estimator of a twin's belief: an exact filter, a learning one, or one with a watch."""
+    """The estimator of a twin's belief: an exact filter, a learning one, or one with a watch.
+
+    It may have a method `for_smoothing(carried)`, which returns the `Carried` of a step with those
+    arrays alone that `smoothed` needs of earlier steps. The twin then keeps no more of most steps,
+    and filters observations again where it needs the rest.
+    """
 
     @property
     def model(self) -> GraphicalModel:

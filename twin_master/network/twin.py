@@ -6,7 +6,6 @@ It never receives the true state.
 from __future__ import annotations
 
 import re
-from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal, get_args
@@ -23,6 +22,7 @@ from twin_master.errors import InvalidModelError, InvalidObservationError
 from twin_master.network.estimator import Carried, Estimate, Estimator, Notice, SensorModel
 from twin_master.network.graphical_model import GraphicalModel
 from twin_master.network.inference import NO_CONTROL, ExactFilter, Predicted, predict
+from twin_master.network.kept_steps import KeptStep, KeptSteps
 from twin_master.network.planner import BeliefPolicy, Hold, RiskPolicy
 from twin_master.network.transition import TransitionModel, checked_beliefs, checked_controls
 
@@ -174,25 +174,6 @@ class TwinStep(Estimate):
         return self.carried.control_index
 
 
-@dataclass(frozen=True)
-class _KeptStep:
-    """A step that the twin keeps, for smoothing and late observations.
-
-    Attributes
-    ----------
-    observation : (G,) array
-        The observed values, SI; NaN where nothing was received.
-    carried : Carried
-        The arrays that the estimator needs of the step.
-    proposals : int
-        How often in a row a harder control was proposed, this step included; 0 without a `Hold`.
-    """
-
-    observation: Float
-    carried: Carried
-    proposals: int = 0
-
-
 class Twin:
     """The belief about one asset, updated step by step, without end.
 
@@ -276,13 +257,11 @@ class Twin:
         self.lag = lag
         # The present step, `lag` steps before it, and one more: to filter the first of these again,
         # the arrays carried on from the step before it are needed.
-        most_kept = None if lag is None else lag + 2
-        self._kept_steps: deque[_KeptStep] = deque(maxlen=most_kept)
-        self._steps = 0
+        self._kept_steps = KeptSteps(self.estimator, None if lag is None else lag + 2)
         self._proposed = self._index_of(first_control)
 
     def __repr__(self) -> str:
-        return brief(self, name=self.name, model=self.model, steps=self._steps, lag=self.lag)
+        return brief(self, name=self.name, model=self.model, steps=self.steps, lag=self.lag)
 
     @property
     def model(self) -> GraphicalModel:
@@ -292,7 +271,7 @@ class Twin:
     @property
     def steps(self) -> int:
         """Number of steps so far."""
-        return self._steps
+        return self._kept_steps.end
 
     @property
     def proposed_control(self) -> int:
@@ -302,17 +281,13 @@ class Twin:
     @property
     def previous_control(self) -> int:
         """Index of the control in force in the last step; `NO_CONTROL` before the first one."""
-        return self.control_of(self._steps - 1) if self._steps > 0 else NO_CONTROL
+        return self.control_of(self.steps - 1) if self.steps > 0 else NO_CONTROL
 
     @property
     def first_kept(self) -> int:
         """The first step of `smoothed`, and the first that may still be revised."""
-        return self._steps - len(self._smoothed_steps())
-
-    @property
-    def _first_in_memory(self) -> int:
-        """The number of the first kept step, which may lie one before `first_kept`."""
-        return self._steps - len(self._kept_steps)
+        first = self._kept_steps.first
+        return first if self.lag is None else max(first, self.steps - self.lag - 1)
 
     def step(self, observation: ArrayLike, control: int | str | None = None) -> TwinStep:
         """Advance by one step, correct by an observation, predict and decide.
@@ -336,7 +311,7 @@ class Twin:
         """
         values = np.array(nan_where_masked(observation))
         index = self._proposed if control is None else self._index_of(control)
-        return self._assimilate_from(self._steps, [(values, index)])
+        return self._assimilate_from(self.steps, [(values, index)])
 
     def revise(
         self, step: int, observation: ArrayLike, control: int | str | None = None
@@ -366,14 +341,14 @@ class Twin:
         ImpossibleObservation, InvalidObservationError, InvalidModelError
             As in `step`; the twin is unchanged.
         """
-        if not self.first_kept <= step < self._steps:
+        if not self.first_kept <= step < self.steps:
             raise IndexError(
                 f"step {step} cannot be revised: the twin keeps the steps from {self.first_kept} "
-                f"on and has seen {self._steps}"
+                f"on and has seen {self.steps}"
             )
         index = self.control_of(step) if control is None else self._index_of(control)
         rows = [(np.array(nan_where_masked(observation)), index)]
-        for later_step in range(step + 1, self._steps):
+        for later_step in range(step + 1, self.steps):
             rows.append((self.observed(later_step), self.control_of(later_step)))
         return self._assimilate_from(step, rows)
 
@@ -390,12 +365,13 @@ class Twin:
         rows : sequence of (G,) array and int
             The observation and the control in force of each step; at least one step.
         """
-        kept_count_before = first_step - self._first_in_memory
-        step_before = self._kept_steps[kept_count_before - 1] if kept_count_before else None
-        # what the estimator carries from step to step
-        previous_carried = step_before.carried if step_before else None
-        proposals = step_before.proposals if step_before else 0
-        new_steps: list[_KeptStep] = []
+        previous_carried = None  # what the estimator carries from step to step
+        proposals = 0
+        if first_step > self._kept_steps.first:
+            (step_before,) = self._kept_steps.complete_steps(first_step - 1, first_step)
+            previous_carried = step_before.carried
+            proposals = step_before.proposals
+        new_steps: list[KeptStep] = []
         notices: list[Notice] = []
         for step, (observation, control_index) in enumerate(rows, start=first_step):
             try:
@@ -423,22 +399,19 @@ class Twin:
                 _, _, (proposals,) = self.decision_rule.decide(
                     probability, in_force, np.array([proposals_before])
                 )
-            new_steps.append(_KeptStep(observation, previous_carried, int(proposals)))
+            new_steps.append(KeptStep(observation, previous_carried, int(proposals)))
             notices += estimate.notices
         # From here on nothing fails, so that a refused observation leaves the twin unchanged.
-        for _ in range(len(self._kept_steps) - kept_count_before):
-            self._kept_steps.pop()
-        self._kept_steps.extend(new_steps)
-        self._steps = first_step + len(rows)
+        self._kept_steps.replace_from(first_step, new_steps)
         return self._decide(replace(estimate, notices=tuple(notices)), proposals_before)
 
     def observed(self, step: int) -> Float:
         """Return the observation (G,) of a kept step; NaN for a sensor without a reading."""
-        return self._kept_steps[step - self._first_in_memory].observation
+        return self._kept_steps[step].observation
 
     def control_of(self, step: int) -> int:
         """Return the index of the control in force in a kept step."""
-        return self._kept_steps[step - self._first_in_memory].carried.control_index
+        return self._kept_steps[step].carried.control_index
 
     def predict(self, belief: ArrayLike, control: int | str, steps: int | None = None) -> Predicted:
         """Predict through the policy from any belief (S,) under a control in force: (37)-(39)."""
@@ -461,12 +434,13 @@ class Twin:
 
     @property
     def carried(self) -> tuple[Carried, ...]:
-        """The arrays that the estimator carried on from each of the steps `first_kept`..t."""
-        return tuple(kept_step.carried for kept_step in self._smoothed_steps())
+        """The arrays that smoothing needs of the steps `first_kept`..t; of the last step, all."""
+        return tuple(self._kept_steps[step].carried for step in range(self.first_kept, self.steps))
 
     def save_state(self) -> bytes:
         """Return everything that the twin keeps, for `restore_state`."""
-        return self._state_of(self._steps, self._kept_steps)
+        kept_steps = self._kept_steps.complete_steps(self._kept_steps.first, self.steps)
+        return self._state_of(self.steps, kept_steps)
 
     def settled(self) -> tuple[int, bytes] | None:
         """Return the last step that cannot be revised any more, and the state after it.
@@ -477,9 +451,9 @@ class Twin:
         step = self.first_kept - 1
         if step < 0:
             return None
-        return step, self._state_of(step + 1, [self._kept_steps[0]])
+        return step, self._state_of(step + 1, self._kept_steps.complete_steps(step, step + 1))
 
-    def _state_of(self, steps: int, kept_steps: Iterable[_KeptStep]) -> bytes:
+    def _state_of(self, steps: int, kept_steps: Iterable[KeptStep]) -> bytes:
         """Return the state of a twin after `steps` steps, of which it keeps some, as bytes."""
         arrays: dict[str, AnyArray] = {"steps": np.array([steps, self._proposed])}
         for index, kept_step in enumerate(kept_steps):
@@ -508,7 +482,7 @@ class Twin:
                 _FORMER_COUNT.sub("steps", name): value for name, value in stored_arrays.items()
             }
             steps, proposed = arrays["steps"].tolist()
-            kept_steps: list[_KeptStep] = []
+            kept_steps: list[KeptStep] = []
             while f"{len(kept_steps)}/control" in arrays:
                 index = len(kept_steps)
                 prefix = f"{index}/carried/"
@@ -518,21 +492,14 @@ class Twin:
                     if name.startswith(prefix)
                 }
                 kept_steps.append(
-                    _KeptStep(
+                    KeptStep(
                         arrays[f"{index}/observation"],
                         Carried(int(arrays[f"{index}/control"]), carried_arrays),
                         int(arrays.get(f"{index}/proposals", 0)),
                     )
                 )
-        self._steps = steps
         self._proposed = proposed
-        self._kept_steps.clear()
-        self._kept_steps.extend(kept_steps)
-
-    def _smoothed_steps(self) -> list[_KeptStep]:
-        """Return the kept steps over which the twin smooths."""
-        kept_steps = list(self._kept_steps)
-        return kept_steps if self.lag is None else kept_steps[-(self.lag + 1) :]
+        self._kept_steps.restore(steps, kept_steps)
 
     def _index_of(self, control: int | str) -> int:
         """Return the index of a control that is given by index or name."""
@@ -599,7 +566,7 @@ class Twin:
             notices=estimate.notices,
             suspicion=suspicion,
             hypotheses=estimate.hypotheses,
-            step=self._steps - 1,
+            step=self.steps - 1,
             prediction=prediction,
             decision_probability=decision_probability,
             next_control=self._proposed,
