@@ -345,6 +345,10 @@ PICTURES: dict[str, Picture] = {
     "high_pass": Picture(
         {"corner_ratio": 0.2}, (ringdown("g0", end=1.5), spectrum("g0", 10.0)), "g0"
     ),
+    "low_pass": Picture(
+        {"time_constant_ratio": 0.5},
+        (ringdown("g0", 0.0, 0.6, "pushed"), ringdown("g0", 2.0, 2.6, "pushed")),
+    ),
     "sensor_lag": Picture(
         {"lag_intervals": 10.0},
         (ringdown("g0", 0.0, 0.6, "pushed"), ringdown("g0", 2.0, 2.6, "pushed")),

@@ -6,6 +6,7 @@ from enum import StrEnum
 from math import nan
 
 from discrepancy.document import Number, Patch
+from fe.runtime.patch import EVERY_CHANNEL
 from reporting.pages.notebook import html_table
 from reporting.words import between, brief, listing, rounded
 
@@ -104,6 +105,11 @@ class NamedEffect:
     """Its exponents, if its law has a free shape; else empty."""
     patch: Patch
     """Primitive changes of the model."""
+
+    @property
+    def place_in_words(self) -> str:
+        """The place, "all channels" for the place "*"."""
+        return "all channels" if self.place == EVERY_CHANNEL else self.place
 
 
 def effect_label(identifier: str, place: str, *, free_shape: bool = False) -> str:
@@ -264,7 +270,8 @@ class ForceAtPort:
     velocity, amplitude, time, recorded input or rate of an input, by the name of that variable; 1
     if the force is a function of the variable, 0 if the two are independent [1]. Displacement and
     velocity together are among the variables if they explain clearly more, and so is the
-    displacement relaxed within some time."""
+    displacement relaxed within some time. At a port of a state, the variables of the motion are
+    that state and, if it explains clearly more, its average over the past."""
     ordered_by: tuple[str, ...]
     """Variables whose value in `orders` is at least 0.3 and within 0.05 of the largest;
     "displacement and velocity" alone if no single variable explains 0.6 of what these explain
@@ -287,6 +294,14 @@ class ForceAtPort:
     def followed_percent(self) -> str:
         """The largest fraction of the force's variance that follows one variable, in %."""
         return f"{100.0 * max(self.orders.values()):.0f}"
+
+    @property
+    def sentence(self) -> str:
+        """That the force is missing, where and how large, and what it depends on."""
+        return (
+            f"A {self.noun} of {self.rms:.3g} {self.unit} (rms) is missing at {self.port}, and no "
+            f"law of the catalogue explains it: {self.dependence}."
+        )
 
     @property
     def dependence(self) -> str:

@@ -29,7 +29,7 @@ from discrepancy.fits.predictive import fit_held_out, residual_set
 from discrepancy.fits.problem import Problem
 from discrepancy.judgement.decide import comparison_of, reach_verdict
 from discrepancy.judgement.exact_sensors import exact_sensor_remarks
-from discrepancy.judgement.hypotheses import calibrated_parameters
+from discrepancy.judgement.hypotheses import UNEXPLAINED_GAP, calibrated_parameters
 from discrepancy.judgement.next_experiment import next_experiments
 from discrepancy.judgement.proof import errors_of_fit, prove_effects
 from discrepancy.judgement.remarks import (
@@ -225,6 +225,8 @@ def investigate(
             proof = prove_effects(
                 before, after, errors=errors, effects=effect_labels(fit), seed=seed
             )
+    if missing is not None and verdict.sentence == UNEXPLAINED_GAP:
+        verdict = replace(verdict, sentence=missing.at_port.sentence)
     fit_of_sensors, fit_of_parameters = _fits_of_estimates(verdict, search, fit)
     experiments: tuple[Experiment, ...] = ()
     if thorough and verdict.kind not in CLOSED_KINDS:

@@ -9,7 +9,7 @@ from scipy.special import hyp1f1, rgamma
 
 from fe.runtime.arrays import FloatArray
 from fe.runtime.errors import InvalidPatchError
-from fe.runtime.patch import HighPass
+from fe.runtime.patch import Filter
 from fe.runtime.sensors import SensorRecord, levels_before_record
 
 _ASYMPTOTIC_FROM = 700.0
@@ -23,9 +23,9 @@ _UNEVEN_SAMPLING = 2e-3
 
 
 def filtered_record(
-    high_pass_filter: HighPass, record: SensorRecord, signal: FloatArray, slope: FloatArray
+    sensor: Filter, record: SensorRecord, signal: FloatArray, slope: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Apply a high-pass filter to the channels of a record and to their rates.
+    """Apply the high-pass with the stages of a filter to channels and to their rates.
 
     The filter needs evenly spaced times; the channels are interpolated to such a grid and back.
 
@@ -42,7 +42,7 @@ def filtered_record(
         The channels after the filter, and their rates [1/s].
     """
     time = record.time
-    time_constant = high_pass_filter.time_constant
+    time_constant = sensor.time_constant
     # even grid, twice as fine as the usual step if the sampling is uneven
     steps = np.diff(time)
     count = max(len(time) - 1, 1)
@@ -57,18 +57,16 @@ def filtered_record(
     signal = _interpolated(grid, time, signal)
     slope = _interpolated(grid, time, slope)
     # signal
-    levels_before = levels_before_record(high_pass_filter, record, signal[0])
-    filtered_signal = high_pass(
-        signal, interval, time_constant, high_pass_filter.order, levels_before
-    )
+    levels_before = levels_before_record(sensor, record, signal[0])
+    filtered_signal = high_pass(signal, interval, time_constant, sensor.order, levels_before)
     # rate; each of several whole stages obeys y' = x' - y / tau
-    is_whole_order = high_pass_filter.order == int(high_pass_filter.order)
+    is_whole_order = sensor.order == int(sensor.order)
     if is_whole_order:
-        for order in range(1, int(high_pass_filter.order) + 1):
+        for order in range(1, int(sensor.order) + 1):
             stage_output = high_pass(signal, interval, time_constant, order, levels_before)
             slope = slope - stage_output / time_constant
     else:
-        slope = high_pass(slope, interval, time_constant, high_pass_filter.order, 0.0)
+        slope = high_pass(slope, interval, time_constant, sensor.order, 0.0)
     return _interpolated(time, grid, filtered_signal), _interpolated(time, grid, slope)
 
 
@@ -117,7 +115,7 @@ def high_pass(
     """
     if not (time_constant > 0.0 and interval > 0.0):
         raise InvalidPatchError(
-            "A high-pass needs a positive time constant and sampling interval, but has "
+            "A filter needs a positive time constant and sampling interval, but has "
             f"{time_constant} s and {interval} s."
         )
     if not 0.0 <= order <= 4.0:

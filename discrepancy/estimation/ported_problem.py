@@ -43,15 +43,28 @@ def can_estimate_forces(problem: Problem) -> bool:
 def shows_all_missing_forces(problem: Problem) -> bool:
     """Return whether missing forces can be estimated in all trials, so that they are comparable.
 
-    Each trial needs at least as many channels as there are ports. Free forces at more ports than
-    that fit any reading, whatever law acts at one of them.
+    Each trial needs at least as many channels as forces at the ports are independent. More free
+    forces than that fit any reading, whatever law acts at one of the ports.
     """
     trials = [data.trial for data in problem.trials]
     return can_estimate_forces(problem) and all(
         shows_missing_force(problem.model, trial)
-        and len(trial.channels) >= len(problem.model.ports)
+        and len(trial.channels) >= _independent_force_count(problem, trial)
         for trial in trials
     )
+
+
+def _independent_force_count(problem: Problem, trial: Trial) -> int:
+    """Return in how many independent ways forces at the ports act on the model in a trial.
+
+    There may be fewer than ports: a force between two masses also acts on each of them.
+    """
+    if not trial.is_dynamic:
+        return len(problem.model.ports)
+    model, _ = problem.model.without_laws()
+    parameters = problem.shared.parameters(problem.prior_mean_point(NO_EFFECTS).shared)
+    system = model.ported_system(trial, problem.campaign.outputs(trial), parameters)
+    return int(np.linalg.matrix_rank(system.actions))
 
 
 def shows_missing_force(model: Model, trial: Trial) -> bool:

@@ -31,7 +31,6 @@ from discrepancy.verdict import Gate
 from reporting.probabilities import normalised_probabilities, probability_of_some
 
 from .closed_share import closed_share_text
-from .hypotheses import UNEXPLAINED_GAP
 from .proof import errors_of_fit
 
 CONTRADICTING_SHARE = -0.1
@@ -89,10 +88,6 @@ class Comparison(ABC, Generic[HypothesisT]):
     @abstractmethod
     def ranked_hypotheses(self) -> Sequence[HypothesisT]:
         """All hypotheses, the most probable first."""
-
-    def gap_sentence(self) -> str:
-        """Return the sentence on a gap that no effect explains."""
-        return UNEXPLAINED_GAP
 
     @abstractmethod
     def _compute_gap_share(self, hypothesis: HypothesisT, *, held_out: bool) -> GapShare:

@@ -13,7 +13,7 @@ from discrepancy.estimation.force_search import ForceSearch
 from discrepancy.fits.candidate import Candidate
 from discrepancy.fits.fitting import CandidateFit, fit, try_fit
 from discrepancy.missing_force.gap_share import GapShare
-from discrepancy.missing_force.port_force import RELAXED_DISPLACEMENT, MissingForce, missing_force
+from discrepancy.missing_force.port_force import HISTORIES, MissingForce, missing_force
 from discrepancy.missing_force.shares import ForceShares
 from discrepancy.search.fitted_candidates import ComparedHypothesis
 from discrepancy.search.strategy import Search
@@ -98,7 +98,7 @@ class ForceComparison(Comparison[Estimate]):
         if hypothesis.leaves_no_force or self._missing_force is None:
             return ""
         force = self._missing_force.at_port
-        relaxed = [name for name in force.ordered_by if name.startswith(RELAXED_DISPLACEMENT)]
+        relaxed = [name for name in force.ordered_by if name.startswith(HISTORIES)]
         patch = hypothesis.candidate.patch(self.problem.setting, hypothesis.effect)
         laws_at_port = [
             law for law in patch if isinstance(law, PortForce) and law.port == force.port
@@ -158,13 +158,3 @@ class ForceComparison(Comparison[Estimate]):
         port = law_ports[0] if law_ports else ports[next(iter(hypothesis.processes))]
         force_unit, *_ = self.problem.model.port_units(port)
         return force_unit
-
-    def gap_sentence(self) -> str:
-        """Return the sentence on a gap that no effect explains: its force, if one was found."""
-        if self._missing_force is None:
-            return super().gap_sentence()
-        force = self._missing_force.at_port
-        return (
-            f"A {force.noun} of {force.rms:.3g} {force.unit} (rms) is missing at {force.port}, and "
-            f"no law of the catalogue explains it: {force.dependence}."
-        )

@@ -317,7 +317,7 @@ def effects_text(effects: Iterable[NamedEffect]) -> str:
                 f"{item.name.replace('_', ' ')} {item.value:.2g}" for item in effect.shape
             )
             text = f"a law of the family {effect.family} ({shape})"
-        texts.append(f"{text} at {effect.place}" if effect.place else text)
+        texts.append(f"{text} at {effect.place_in_words}" if effect.place else text)
     return listing(dict.fromkeys(texts))
 
 

@@ -17,6 +17,7 @@ from reporting.words import capital, listing, small
 
 from .comparison import EffectSet, HypothesisT
 from .hypotheses import (
+    UNEXPLAINED_GAP,
     VerdictOutcome,
     curve_sentence,
     effects_text,
@@ -66,7 +67,7 @@ def decide_on_noise(case: NoiseCase[HypothesisT]) -> VerdictOutcome:
 def gap_verdict(case: NoiseCase[HypothesisT]) -> VerdictOutcome:
     """Return the verdict that there is a gap which no effect of the catalogue explains."""
     return case.unexplained(
-        case.comparison.gap_sentence(),
+        UNEXPLAINED_GAP,
         case.no_effect_gate.reason,
         case.probabilities[case.leading_set],
         (case.no_effect_gate,),
@@ -169,7 +170,7 @@ def failed_test_verdict(case: NoiseCase[HypothesisT], checked_fit: CheckedFit) -
         nearest_effects = effects_text(named_effects(case.problem, case.leading_fit))
         reason = f"The nearest in the catalogue is {nearest_effects}, but {small(reason)}"
     return case.unexplained(
-        case.comparison.gap_sentence(),
+        UNEXPLAINED_GAP,
         reason,
         case.probability,
         _gates(case, checked_fit),
@@ -255,7 +256,7 @@ def undecided_verdict(case: NoiseCase[HypothesisT]) -> VerdictOutcome:
     if group:
         reason = f"{len(group)} explanations fit equally well."
     return case.unexplained(
-        case.comparison.gap_sentence(),
+        UNEXPLAINED_GAP,
         reason,
         total_probability(case.probabilities[names] for names in case.probable_sets),
         (most_probable.absolute_fit,),

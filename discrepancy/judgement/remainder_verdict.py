@@ -18,6 +18,7 @@ from reporting.words import capital, listing, small
 from .closed_share import compared_trials_text, percent_with_interval
 from .comparison import Comparison, HypothesisT, effect_place_pairs, family_place_pairs
 from .hypotheses import (
+    UNEXPLAINED_GAP,
     VerdictOutcome,
     WeightedHypothesis,
     curve_sentence,
@@ -55,7 +56,8 @@ def decide_on_remainder(
         return unexplained_outcome(comparison, noise_verdict, best_hypothesis, reason)
     # conditions that a name must fulfil
     if comparison.enlarges_error(best_hypothesis):
-        return unexplained_outcome(comparison, noise_verdict, best_hypothesis)
+        mentioned_hypothesis = comparison.more_probable_rival(best_hypothesis) or best_hypothesis
+        return unexplained_outcome(comparison, noise_verdict, mentioned_hypothesis)
     remaining_error = comparison.reason_of_remaining_error(best_hypothesis)
     if remaining_error:
         return unexplained_outcome(comparison, noise_verdict, best_hypothesis, remaining_error)
@@ -322,7 +324,7 @@ def unexplained_outcome(
     return _outcome(
         comparison,
         VerdictKind.UNEXPLAINED,
-        comparison.gap_sentence(),
+        UNEXPLAINED_GAP,
         noise_verdict.probability,
         judged_hypothesis=judged_hypothesis,
         members=[],

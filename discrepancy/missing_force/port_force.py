@@ -39,8 +39,11 @@ follows the two together. On simulated rigs it is at most 0.5 for impacts with l
 NEIGHBOURS, CANDIDATE_NEIGHBOURS = 3, 100
 """Number of neighbours whose mean force predicts that of a sample, and number of nearest samples
 among which they are looked for."""
-RELAXED_DISPLACEMENT = "the displacement relaxed"
-"""Beginning of the names of variables that depend on the history of the motion."""
+RELAXED_DISPLACEMENT = "the displacement relaxed within"
+AVERAGED_STATE = "the state averaged over the past"
+HISTORIES = (RELAXED_DISPLACEMENT, AVERAGED_STATE)
+"""Beginnings of the names of variables that depend on the history of the motion; a port of a state
+has the second one."""
 RELAXATION_TIMES = np.geomspace(2.0, 200.0, 12)
 """Relaxation times with which the displacement is tried as a variable, in sampling intervals."""
 
@@ -119,19 +122,22 @@ def variance_explained_by_state(trial_forces: Sequence["TrialForce"]) -> float:
 
 def explanatory_variables(
     force: FloatArray,
-    position: FloatArray,
+    position: FloatArray | None,
     speed: FloatArray,
     time: FloatArray,
     other_variables: Mapping[str, FloatArray],
 ) -> tuple[dict[str, float], tuple[str, ...]]:
     """Return the variables of which a force is nearly a function, each of one alone.
 
-    Displacement, velocity, amplitude of the vibration and time are always tried.
+    Displacement, velocity, amplitude of the vibration and time are always tried; at a port of a
+    state, the state and time.
 
     Parameters
     ----------
-    force, position, speed, time : (N,) array
-        The force, the motion of its port, and the time.
+    force, speed, time : (N,) array
+        The force, the speed of its port or its state, and the time.
+    position : (N,) array or None
+        The displacement of the port; None at a port of a state.
     other_variables : mapping of str to (N,) array
         Recorded inputs, their rates and a relaxed displacement, by name. A missing force is a
         function of an input if the input that acts is smaller or larger than the recorded one, of
@@ -146,17 +152,20 @@ def explanatory_variables(
         The variables whose share is at least `LEAST_ORDER`, and at most `TIED_SHARE` below the
         largest one. Empty if there is none.
     """
-    # unit standard deviations, so that position and speed of a harmonic motion form a circle
-    scaled_position = position / max(float(np.std(position)), LEAST_DIVISOR)
-    scaled_speed = speed / max(float(np.std(speed)), LEAST_DIVISOR)
-    # amplitude of a vibration; in a cycle the force changes its sign, but not its magnitude
-    amplitude = np.hypot(scaled_position, scaled_speed)
-    shares = {
-        "displacement": explained_variance(position, force),
-        "velocity": explained_variance(speed, force),
-        "amplitude": explained_variance(amplitude, np.abs(force)),
-        "time": explained_variance(time, force),
-    }
+    if position is None:
+        shares = {"state": explained_variance(speed, force)}
+    else:
+        # unit standard deviations, so that position and speed of a harmonic motion form a circle
+        scaled_position = position / max(float(np.std(position)), LEAST_DIVISOR)
+        scaled_speed = speed / max(float(np.std(speed)), LEAST_DIVISOR)
+        # amplitude of a vibration; in a cycle the force changes its sign, but not its magnitude
+        amplitude = np.hypot(scaled_position, scaled_speed)
+        shares = {
+            "displacement": explained_variance(position, force),
+            "velocity": explained_variance(speed, force),
+            "amplitude": explained_variance(amplitude, np.abs(force)),
+        }
+    shares["time"] = explained_variance(time, force)
     for name, values in other_variables.items():
         shares[name] = explained_variance(values, force)
     least_share = max(LEAST_ORDER, max(shares.values()) - TIED_SHARE)
@@ -167,7 +176,8 @@ def relaxed_displacement(time: FloatArray, speed: FloatArray, relaxation_time: f
     """Return the elongation (N,) of a spring in series with a damper: z' = v - z / relaxation_time.
 
     For a long relaxation time it is the displacement since the first sample, and for a short one it
-    is proportional to the speed. In between it depends on the history of the motion.
+    is proportional to the speed. In between it depends on the history of the motion. Of a state in
+    the place of the speed it is the average over the past, times the relaxation time.
 
     Parameters
     ----------
@@ -205,6 +215,9 @@ class TrialForce:
         that no law explains [N, N m or the port's flow].
     law : (N,) array or None
         The force of the effect in the verdict along the same motion; None if it has no law here.
+    is_of_state : bool
+        Whether the port is one of a state, such as a temperature: its position is then without
+        meaning.
     """
 
     trial: str
@@ -215,6 +228,7 @@ class TrialForce:
     force: FloatArray
     deviation: FloatArray
     law: FloatArray | None
+    is_of_state: bool = False
 
     @property
     def left(self) -> FloatArray:
@@ -275,8 +289,11 @@ def missing_force(search: ForceSearch, estimate: Estimate) -> MissingForce | Non
         term.name_in_words for term in estimate.candidate.terms if term.port == port
     )
     recorded = {trial.name: trial for trial in search.ported.problem.campaign.trials}
+    is_of_state = search.ported.problem.setting.scales.ports[port].of_state
     trial_forces = _with_history_of_motion(
-        _forces_by_trial(estimate, port_index, recorded, has_law=bool(law_name))
+        _forces_by_trial(
+            estimate, port_index, recorded, has_law=bool(law_name), is_of_state=is_of_state
+        )
     )
     unit, *_ = search.ported.problem.model.port_units(port)
     correlation_time = estimate.processes[port_index].correlation_time
@@ -287,13 +304,19 @@ def missing_force(search: ForceSearch, estimate: Estimate) -> MissingForce | Non
 
 
 def _forces_by_trial(
-    estimate: Estimate, port: int, recorded: Mapping[str, Trial], *, has_law: bool
+    estimate: Estimate,
+    port: int,
+    recorded: Mapping[str, Trial],
+    *,
+    has_law: bool,
+    is_of_state: bool,
 ) -> list[TrialForce]:
     """Return the force that the model lacks at a port in each trial, with the motion of the port.
 
     The model lacks the force of the hypothesis' law and the missing force, which no law explains.
     With `has_law`, the result also has the force of the law by itself. `port` is the index of the
-    port, and `recorded` has the trials as they were recorded, by name.
+    port, `recorded` has the trials as they were recorded, by name, and `is_of_state` says whether
+    the port is one of a state.
     """
     trial_forces = []
     # the few load steps at rest tell little beside records in motion
@@ -316,6 +339,7 @@ def _forces_by_trial(
                 force=smoothed_trial.lacking_forces[port][samples],
                 deviation=filtered_trial.missing_force_deviations[port][samples],
                 law=law_force,
+                is_of_state=is_of_state,
             )
         )
     return trial_forces
@@ -405,6 +429,7 @@ def _explanatory_variables_of_trials(
         velocity together explain clearly more than any variable alone, as for an impact with loss,
         it is `STATE` alone.
     """
+    is_of_state = trial_forces[0].is_of_state
     # an input that was not recorded in a trial did not act there
     names = dict.fromkeys(name for trial in trial_forces for name in trial.variables)
     other_variables = {
@@ -415,11 +440,15 @@ def _explanatory_variables_of_trials(
     }
     shares, ordered_by = explanatory_variables(
         force=np.concatenate([trial.force for trial in trial_forces]),
-        position=np.concatenate([trial.position for trial in trial_forces]),
+        position=None
+        if is_of_state
+        else np.concatenate([trial.position for trial in trial_forces]),
         speed=np.concatenate([trial.speed for trial in trial_forces]),
         time=np.concatenate([trial.time for trial in trial_forces]),
         other_variables=other_variables,
     )
+    if is_of_state:
+        return shares, ordered_by
     share_of_state = variance_explained_by_state(trial_forces)
     is_by_one_variable = max(shares.values()) > LARGEST_SINGLE_SHARE * share_of_state
     if is_by_one_variable or share_of_state < LEAST_ORDER:
@@ -450,7 +479,8 @@ def _with_history_of_motion(trial_forces: Sequence[TrialForce]) -> list[TrialFor
     )
     if share_of_relaxation[best_time] < max(shares.values()) + TIED_SHARE:
         return list(trial_forces)
-    name = f"{RELAXED_DISPLACEMENT} within {best_time:.2g} s"
+    history = AVERAGED_STATE if trial_forces[0].is_of_state else RELAXED_DISPLACEMENT
+    name = f"{history} {best_time:.2g} s"
     trials_with_history = []
     for trial in trial_forces:
         relaxed_in_trial = relaxed_displacement(trial.time, trial.speed, best_time)

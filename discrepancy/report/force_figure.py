@@ -80,7 +80,7 @@ def _variables(missing: MissingForce) -> tuple[Variable, Variable]:
         displacement = Variable("position", "integral of the state")
         speed = Variable("speed", f"state, {speed_unit}")
     followed = next(iter(missing.at_port.ordered_by), "displacement")
-    if followed == "velocity":
+    if followed in ("velocity", "state"):
         return speed, displacement
     if any(followed in course.variables for course in missing.courses):
         return Variable(followed, followed.removeprefix("the ")), displacement

@@ -122,7 +122,7 @@ def _location(verdict: Verdict) -> Answer:
         return Answer(question, f"at {force.port}", certainty)
     if group_members(verdict):
         return Answer(question, "", "")
-    places = dict.fromkeys(effect.place for effect in verdict.effects if effect.place)
+    places = {effect.place: effect.place_in_words for effect in verdict.effects if effect.place}
     if not places:
         return Answer(question, "", "")
     probability = sum(
@@ -131,7 +131,7 @@ def _location(verdict: Verdict) -> Answer:
         if places.keys() <= {effect.place for effect in hypothesis.effects}
     )
     certainty = f"probability {probability_text(min(probability, 1.0))}"
-    return Answer(question, f"at {listing(places)}", certainty)
+    return Answer(question, f"at {listing(places.values())}", certainty)
 
 
 def _dependence(verdict: Verdict, shape: str) -> Answer:

@@ -18,6 +18,7 @@ from discrepancy.workflow import Investigation
 from fe.runtime.patch import (
     CHANNEL_UNIT,
     InterfaceCompliance,
+    LowPass,
     ModelPatch,
     PlaceMass,
     PowerDamping,
@@ -109,6 +110,9 @@ def _verb(interval: PrimitiveInterval, primitive: Primitive, *, is_flow: bool) -
     if isinstance(primitive, SensorLag):
         channel = "each channel" if primitive.channel == "*" else primitive.channel
         return f"{channel} {'lags' if interval.value > 0.0 else 'leads'} by"
+    if isinstance(primitive, LowPass):
+        channel = "each channel" if primitive.channel == "*" else primitive.channel
+        return f"{channel} responds with a time constant of"
     if interval.parameter != "coefficient":
         return ""
     if isinstance(primitive, PowerDamping):

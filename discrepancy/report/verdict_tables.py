@@ -117,7 +117,7 @@ def effects_table(content: ReportInput) -> Table:
     is_group = bool(group_members(verdict))
     columns: list[RecordColumn[EffectRow]] = [
         text_cells("effect", lambda row: row.effect.name),
-        text_cells("place", lambda row: row.effect.place or UNKNOWN),
+        text_cells("place", lambda row: row.effect.place_in_words or UNKNOWN),
         text_cells("parameter", lambda row: row.description),
         number_cells("value", lambda row: row.value),
         number_cells("90 % interval", lambda row: row.interval),
@@ -148,7 +148,7 @@ def printed_effects_table(verdict: Verdict) -> Table:
     """Return the parameters of the effects of a verdict, for the terminal."""
     columns: list[RecordColumn[EffectRow]] = [
         text_cells("effect", lambda row: row.effect.identifier),
-        text_cells("place", lambda row: row.effect.place),
+        text_cells("place", lambda row: row.effect.place_in_words),
         text_cells("parameter", _parameter_name),
         text_cells("value", lambda row: row.value),
         text_cells("90 % interval", lambda row: row.interval),

@@ -71,7 +71,7 @@ def search(
         if second_fit is not None and second_fit.objective < no_effect.objective - least_gain:
             result = Search(problem, usable_effects, second_fit, on_progress=on_progress)
     on_search(result)
-    if shows_all_missing_forces(problem) and result.force_search is not None:
+    if result.force_search is not None and shows_all_missing_forces(problem):
         result.search_by_missing_force(result.force_search)
     else:
         result.search_single_effects()

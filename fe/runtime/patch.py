@@ -31,9 +31,11 @@ from .sensor_primitives import PER_RELEASE as PER_RELEASE
 from .sensor_primitives import ChannelOffset as ChannelOffset
 from .sensor_primitives import Clock as Clock
 from .sensor_primitives import DecayingLine as DecayingLine
+from .sensor_primitives import Filter as Filter
 from .sensor_primitives import HighPass as HighPass
 from .sensor_primitives import Line as Line
 from .sensor_primitives import LoggerClock as LoggerClock
+from .sensor_primitives import LowPass as LowPass
 from .sensor_primitives import RunOffset as RunOffset
 from .sensor_primitives import Sensor as Sensor
 from .sensor_primitives import SensorDrift as SensorDrift
@@ -299,6 +301,7 @@ SENSORS = (
     SensorRotation,
     ThermalStrain,
     HighPass,
+    LowPass,
     SensorLag,
     Clock,
     LoggerClock,

@@ -267,6 +267,26 @@ class HighPass(Sensor):
     """Quantity of the channels if `channel` is "*"; empty for all quantities."""
 
 
+class LowPass(Sensor):
+    """Channels respond with a delay of first order, 1 / (1 + s tau), tau the `time_constant`.
+
+    Examples are a thermometer in its housing and an anti-aliasing filter. The caller of
+    `fe.runtime.sensors.apply_sensors` supplies the filter.
+    """
+
+    order: ClassVar[float] = 1.0
+    channel: str
+    """Name of the channel, or "*" for all channels of `quantity`."""
+    time_constant: Annotated[float, "s"]
+    """Time in which a reading follows a step to 63 %."""
+    quantity: str = ""
+    """Quantity of the channels if `channel` is "*"; empty for all quantities."""
+
+
+Filter = HighPass | LowPass
+"""The sensors that filter: each is computed from its high-pass, see `apply_sensors`."""
+
+
 class SensorLag(Sensor):
     """A channel shows each value `lag` [s] too late, because of a filter or a logger.
 

@@ -17,7 +17,16 @@ from numpy.typing import NDArray
 from .arrays import FloatArray
 from .errors import InvalidPatchError
 from .modal_system import exponential
-from .patch import EVERY_CHANNEL, Clock, HighPass, LoggerClock, ModelPatch, Sensor, SensorRotation
+from .patch import (
+    EVERY_CHANNEL,
+    Clock,
+    Filter,
+    LoggerClock,
+    LowPass,
+    ModelPatch,
+    Sensor,
+    SensorRotation,
+)
 from .patch import SensorRecord as SensorRecord
 from .primitive import Primitive
 
@@ -25,7 +34,7 @@ Channels = Sequence[tuple[str, str]]
 """Name and quantity of each column of a record."""
 
 HighPassFilter = Callable[
-    [HighPass, SensorRecord, FloatArray, FloatArray], tuple[FloatArray, FloatArray]
+    [Filter, SensorRecord, FloatArray, FloatArray], tuple[FloatArray, FloatArray]
 ]
 """A function that filters columns (N, C) of a dynamic record and their rates (N, C)."""
 
@@ -105,8 +114,8 @@ def apply_sensors(
     Rotations come first, because a gauge senses the strain of the skin before anything else happens
     to it; several rotations of one gauge add up. The other primitives follow in the order of the
     patch. A primitive whose channel is not in the record changes nothing; `check_channels` finds
-    names that exist nowhere. High-pass filters and lines act in dynamic trials only: rows of static
-    trials and of flights are settled readings. Without sensor faults the input is returned as it
+    names that exist nowhere. Filters and lines act in dynamic trials only: rows of static trials
+    and of flights are settled readings. Without sensor faults the input is returned as it
     is.
 
     Parameters
@@ -120,8 +129,8 @@ def apply_sensors(
     transverse, shear : (N, C) array, optional
         Strain across the direction of each gauge and engineering shear strain, for rotations.
     high_pass : callable
-        The high-pass filter: `fe.high_pass.filtered_record`, or `FilterMemory.filter_row` for one
-        row of a longer record, which has no rates.
+        The high-pass with the stages of a filter: `fe.high_pass.filtered_record`, or
+        `FilterMemory.filter_row` for one row of a longer record, which has no rates.
 
     Returns
     -------
@@ -152,10 +161,14 @@ def apply_sensors(
             continue
         signal = readings[:, columns]
         signal_rate = slopes[:, columns]
-        if not isinstance(sensor, HighPass):
+        if not isinstance(sensor, Filter):
             faulty_signal, faulty_rate = sensor.readings(record, signal, signal_rate)
         elif record.is_dynamic:
             faulty_signal, faulty_rate = high_pass(sensor, record, signal, signal_rate)
+            if isinstance(sensor, LowPass):
+                # a low-pass of first order passes what the high-pass removes
+                faulty_signal = signal - faulty_signal
+                faulty_rate = signal_rate - faulty_rate
         else:
             continue
         acts = sensor.acts_at(record.time)[:, np.newaxis]
@@ -232,23 +245,22 @@ def columns_of(primitive: Primitive, channels: Channels) -> NDArray[np.intp]:
     return np.array(columns, dtype=np.intp)
 
 
-def levels_before_record(
-    high_pass: HighPass, record: SensorRecord, first_row: FloatArray
-) -> FloatArray:
-    """Return the constant inputs (C,) of a high-pass filter before the first row of a record.
+def levels_before_record(sensor: Filter, record: SensorRecord, first_row: FloatArray) -> FloatArray:
+    """Return the constant inputs (C,) of a filter before the first row of a record.
 
     If the structure was at rest before, the input was the first reading, or zero for a channel that
-    measures a rate. If it moved already, the input is taken as zero, the middle of its motion.
+    measures a rate. If it moved already, the input of a high-pass is taken as zero, the middle of
+    its motion, and a slow sensor as showing what it measures.
     """
     if not record.settled:
-        return np.zeros_like(first_row)
-    columns = columns_of(high_pass, record.channels)
+        return first_row if isinstance(sensor, LowPass) else np.zeros_like(first_row)
+    columns = columns_of(sensor, record.channels)
     is_rate = [record.channels[column][1] in RATES for column in columns]
     return np.where(is_rate, 0.0, first_row)
 
 
 class FilterMemory:
-    """The states of high-pass filters between two rows of a record that is read row by row.
+    """The states of filters between two rows of a record that is read row by row.
 
     The signal is taken as linear between the rows.
 
@@ -272,23 +284,23 @@ class FilterMemory:
         self.states: list[float] = []
 
     def filter_row(
-        self, high_pass: HighPass, record: SensorRecord, row: FloatArray, rates: FloatArray
+        self, sensor: Filter, record: SensorRecord, row: FloatArray, rates: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
-        """Filter one row (1, C), and return zeros for its rates, as a `HighPassFilter`.
+        """Pass one row (1, C) through the high-pass of a filter, and return zeros for its rates.
 
         Raises
         ------
         InvalidPatchError
             If the time constant is not positive, or there are not 1 to `LARGEST_ORDER` stages.
         """
-        if not (high_pass.time_constant > 0.0 and high_pass.order in range(1, LARGEST_ORDER + 1)):
+        if not (sensor.time_constant > 0.0 and sensor.order in range(1, LARGEST_ORDER + 1)):
             raise InvalidPatchError(
-                "A high-pass that is read sample by sample needs a positive time constant and 1 to "
-                f"{LARGEST_ORDER} stages, but {high_pass} was given."
+                "A filter that is read sample by sample needs a positive time constant and 1 to "
+                f"{LARGEST_ORDER} stages, but {sensor} was given."
             )
-        order = int(high_pass.order)
+        order = int(sensor.order)
         signals = row[0].tolist()
-        levels = levels_before_record(high_pass, record, row[0]).tolist()
+        levels = levels_before_record(sensor, record, row[0]).tolist()
         outputs = []
         for signal, level in zip(signals, levels, strict=True):
             if self._previous is None:
@@ -298,7 +310,7 @@ class FilterMemory:
                 stages = high_pass_step(
                     np.array(previous_stages),
                     signal - previous_signal,
-                    self._duration / high_pass.time_constant,
+                    self._duration / sensor.time_constant,
                 )
             outputs.append(stages[-1])
             self.states += [signal, *stages.tolist()]

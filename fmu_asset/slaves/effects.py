@@ -15,7 +15,7 @@ from typing import NamedTuple, TypeAlias, TypedDict
 import numpy as np
 
 from fe.runtime.arrays import FloatArray
-from fe.runtime.patch import CHANNEL_UNIT, PER_RELEASE, PRIMITIVES, HighPass, ModelPatch
+from fe.runtime.patch import CHANNEL_UNIT, PER_RELEASE, PRIMITIVES, Filter, ModelPatch
 from fe.runtime.patch_arrays import PatchArrays
 from fe.runtime.patched_wing import PatchedWing
 from fe.runtime.sensors import FilterMemory, SensorRecord, apply_sensors, needs_structure
@@ -297,7 +297,7 @@ class SwitchableEffects:
         patch = ModelPatch.from_list(active_primitives(self._effects, by_name))
         filters = []
         for primitive in patch:
-            if isinstance(primitive, HighPass):
+            if isinstance(primitive, Filter):
                 filters.append((primitive.channel, primitive.quantity, primitive.order))
         return ActiveEffects(
             values=tuple(values),

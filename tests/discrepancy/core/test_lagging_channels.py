@@ -1,4 +1,4 @@
-"""A channel that shows what it should have shown earlier: a late filter or logger."""
+"""A channel that shows what it should have shown earlier: a late logger, or a slow sensor."""
 
 import numpy as np
 import pytest
@@ -8,7 +8,7 @@ from discrepancy.system.response import Conditions
 from discrepancy.system.sensing import observe
 from discrepancy.verdict import Verdict, VerdictKind
 from discrepancy.workflow import investigate
-from fe.runtime.patch import ModelPatch, SensorLag
+from fe.runtime.patch import LowPass, ModelPatch, Sensor, SensorLag
 from tests.costs import once
 from tests.discrepancy.rigs import chosen, one_mass
 
@@ -25,8 +25,8 @@ MODEL = one_mass(
 )
 
 
-def shaken(lag: float) -> Campaign:
-    """Return two trials under forces of many frequencies, the second held out, with a channel that lags."""
+def shaken(sensor: Sensor) -> Campaign:
+    """Return two trials under forces of many frequencies, the second held out, read by a sensor of "x"."""
     generator = np.random.default_rng(4)
     trials = []
     for name in ("first", "second"):
@@ -50,7 +50,7 @@ def shaken(lag: float) -> Campaign:
     conditions = Conditions(np.ones(2))
     measured = []
     for trial in trials:
-        values = observe(MODEL, empty, trial, ModelPatch((SensorLag("x", lag),)), conditions).values
+        values = observe(MODEL, empty, trial, ModelPatch((sensor,)), conditions).values
         noise = NOISE * generator.standard_normal(values.shape)
         measured.append(
             Trial.plain(
@@ -73,7 +73,8 @@ def verdict_with_lag(lag: float) -> Verdict:
 
     It delays it not by the same time at every frequency.
     """
-    return investigate(shaken(lag), MODEL, chosen("sensor_lag", "structural_damping"), thorough=False).verdict
+    effects = chosen("sensor_lag", "structural_damping")
+    return investigate(shaken(SensorLag("x", lag)), MODEL, effects, thorough=False).verdict
 
 
 @pytest.mark.slow
@@ -96,3 +97,16 @@ def test_the_lag_of_a_channel_is_estimated():
 def test_no_lag_is_named_where_there_is_none():
     verdict = verdict_with_lag(0.0)
     assert verdict.kind is VerdictKind.NOTHING_MISSING, verdict.sentence
+
+
+@pytest.mark.slow
+def test_a_slow_sensor_is_named_beside_a_lag_and_damping():
+    """Its low-pass delays all frequencies nearly alike, and makes fast motion smaller."""
+    effects = chosen("low_pass", "sensor_lag", "high_pass", "structural_damping")
+    verdict = investigate(shaken(LowPass("x", LAG)), MODEL, effects, thorough=False).verdict
+    assert verdict.kind is VerdictKind.NAMED, verdict.sentence
+    (effect,) = verdict.effects
+    assert (effect.identifier, effect.place) == ("low_pass", "x")
+    (ratio,) = effect.parameters
+    # time constant times the angular frequency of 800 N/m and 2 kg
+    assert ratio.low < 20.0 * LAG < ratio.high

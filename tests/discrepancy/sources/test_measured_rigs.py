@@ -142,7 +142,7 @@ def test_effects_that_make_the_held_out_record_of_the_tanks_worse_are_not_named(
 
 def test_the_place_of_what_a_pendulum_lacks_is_said(tmp_path):
     effects = chosen("coulomb_friction", "quadratic_damping")
-    found = investigate(*rig("pendulum", tmp_path), effects, thorough=False)
+    found = investigate(*rig("pendulum", tmp_path), effects)
     assert found.verdict.kind is VerdictKind.UNEXPLAINED
     assert "is missing at pivot, and no law of the catalogue explains it: " in found.verdict.sentence
     assert found.proof is None or found.proof.closed.value < 0.5

@@ -1,4 +1,4 @@
-"""High-pass filters of records, against closed forms."""
+"""Filters of records, against closed forms."""
 
 from dataclasses import replace
 
@@ -10,7 +10,7 @@ from scipy.special import hyp1f1
 
 from fe.high_pass import filtered_record, high_pass
 from fe.runtime.errors import InvalidPatchError
-from fe.runtime.patch import HighPass, ModelPatch
+from fe.runtime.patch import HighPass, LowPass, ModelPatch
 from fe.runtime.sensors import FilterMemory, SensorRecord, apply_sensors
 from tests.fe.runtime.sensor_records import CHANNELS, FORCED, RATES, RINGDOWN, VALUES, show
 
@@ -59,7 +59,7 @@ def test_a_whole_order_is_the_limit_of_broken_orders():
     [(0.0, 0.1, 1.0), (0.1, -1.0, 1.0), (0.1, 0.1, 4.5), (0.1, 0.1, -0.5)],
 )
 def test_an_impossible_filter_is_refused(interval, time_constant, order):
-    with pytest.raises(InvalidPatchError, match="high-pass"):
+    with pytest.raises(InvalidPatchError, match=r"high-pass|filter"):
         high_pass(SIGNAL, interval, time_constant, order)
 
 
@@ -142,3 +142,50 @@ def test_a_high_pass_follows_uneven_stamps():
     (filtered,) = values.T
     # the gap of eight intervals is bridged by a straight line
     np.testing.assert_allclose(filtered, expected, atol=8e-3)
+
+
+# ---------------------------------------------------------------- slow sensors
+
+
+def test_a_slow_sensor_follows_a_step_by_its_time_constant():
+    step = np.ones_like(VALUES)
+    settled_at_zero = replace(FORCED, channels=ACCELERATIONS)
+
+    values, _ = show(LowPass("*", 0.4), record=settled_at_zero, values=step, rates=0.0 * step)
+
+    expected = 1.0 - np.exp(-FORCED.time / 0.4)
+    np.testing.assert_allclose(values, np.tile(expected[:, None], 3), atol=1e-12)
+
+
+def test_a_slow_sensor_shows_a_sine_smaller_and_later():
+    omega, time_constant = 7.0, 0.1
+    signal = np.sin(omega * FORCED.time)[:, None] * np.ones(3)
+    rates = omega * np.cos(omega * FORCED.time)[:, None] * np.ones(3)
+
+    values, _ = show(LowPass("*", time_constant), record=FORCED, values=signal, rates=rates)
+
+    transfer = 1.0 / (1.0 + 1j * omega * time_constant)
+    steady = np.imag(transfer * np.exp(1j * omega * FORCED.time))
+    expected = steady - steady[0] * np.exp(-FORCED.time / time_constant)
+    # the sine is taken as linear between samples
+    np.testing.assert_allclose(values[:, 0], expected, atol=1e-3)
+
+
+def test_rates_of_a_slow_sensor_are_those_of_its_values():
+    values, rates = show(LowPass("*", 0.4))
+
+    slope = (values[2:] - values[:-2]) / 0.02
+    assert rates[1:-1] == pytest.approx(slope, abs=2e-3)
+
+
+@pytest.mark.parametrize("is_settled", [True, False])
+def test_a_slow_sensor_shows_the_first_value_as_it_is(is_settled):
+    values, _ = show(LowPass("*", 0.4), record=replace(FORCED, settled=is_settled))
+
+    assert values[0] == pytest.approx(VALUES[0])
+
+
+def test_a_slow_sensor_shows_settled_readings_as_they_are():
+    values, _ = show(LowPass("*", 0.4), record=replace(FORCED, kind="static"))
+
+    np.testing.assert_array_equal(values, VALUES)
