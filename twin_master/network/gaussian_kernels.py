@@ -27,6 +27,21 @@ EXPONENT_BIAS = 1023
 """A double with the exponent bits n + 1023 and the fraction zero is 2^n."""
 FRACTION_BITS = 52
 """Number of bits of the fraction of a double."""
+LOG_SERIES = (
+    6.666666666666735130e-01,
+    3.999999999940941908e-01,
+    2.857142874366239149e-01,
+    2.222219843214978396e-01,
+    1.818357216161805012e-01,
+    1.531383769920937332e-01,
+    1.479819860511658591e-01,
+)
+"""Coefficients of log((1 + s) / (1 - s)) - 2 s, divided by s, in powers of s^2."""
+ROOT_HALF_BITS = 0x3FE6A09E667F3BCD
+"""The bits of sqrt(1/2)."""
+WHOLE_NUMBER = 1.5 * 2.0**52
+"""The last bits of a sum of this and a whole number are the whole number."""
+WHOLE_NUMBER_BITS = 0x4338000000000000
 LEAST_EXPONENT = -708.0
 """Exponents are cut to this: exp of a smaller number is negligible compared with one."""
 ROUNDING = 1e-13
@@ -88,6 +103,38 @@ def fill_exponentials(
         odd = fraction * ((ODD[0] * square + ODD[1]) * square + ODD[2])
         mantissa[b] = 1.0 + 2.0 * odd / (even - odd)
         power_bits[b] = (np.int64(power_of_two) + EXPONENT_BIAS) << FRACTION_BITS
+
+
+@partial(callable_when_compiled, makes_arrays=False, inline=True)
+def fill_logarithms(value: Float, logarithm: Float, work_bits: Index) -> None:
+    """Compute the natural logarithms of positive normal numbers (B,) (fdlibm, Sun 1993).
+
+    The method is written out for the reason that `fill_exponentials` gives. `work_bits` (B,) is
+    work space.
+    """
+    # value = 2^power * mantissa, with the mantissa between sqrt(1/2) and sqrt(2).
+    bits = value.view(np.int64)
+    mantissa = logarithm.view(np.int64)
+    for b in range(len(value)):
+        power = (bits[b] - ROOT_HALF_BITS) >> FRACTION_BITS
+        mantissa[b] = bits[b] - (power << FRACTION_BITS)
+        work_bits[b] = power + WHOLE_NUMBER_BITS
+    whole_number = work_bits.view(np.float64)
+    for b in range(len(value)):
+        power_of_two = whole_number[b] - WHOLE_NUMBER
+        excess = logarithm[b] - 1.0
+        ratio = excess / (2.0 + excess)
+        square = ratio * ratio
+        series = LOG_SERIES[6]
+        series = LOG_SERIES[5] + square * series
+        series = LOG_SERIES[4] + square * series
+        series = LOG_SERIES[3] + square * series
+        series = LOG_SERIES[2] + square * series
+        series = LOG_SERIES[1] + square * series
+        series = square * (LOG_SERIES[0] + square * series)
+        half_square = 0.5 * excess * excess
+        low = ratio * (half_square + series) + power_of_two * LOG_TWO_LOW
+        logarithm[b] = power_of_two * LOG_TWO_HIGH - ((half_square - low) - excess)
 
 
 @callable_when_compiled

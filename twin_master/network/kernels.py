@@ -3,7 +3,8 @@
 A belief is kept both as probabilities and as their logarithms. A transition is a product of blocks,
 each applied along its own axis of the joint state. A sum over predecessors is formed of the
 probabilities if the sum is at least `SAFE`: terms that underflowed are then less than one part in
-1e27 of it, far below rounding. Otherwise the sum is formed of the logarithms.
+1e27 of it, far below rounding. Otherwise the sum is formed of the logarithms. Logarithms of other
+sums, which only the result needs, are computed side by side after the last block.
 
 Numbers are copied one by one, because numba takes two seconds to compile the copy of an array.
 """
@@ -15,13 +16,22 @@ import numpy as np
 
 from fe.compilation import callable_when_compiled, compiled
 from reporting.arrays import Float, Index, Unsigned
+from twin_master.network.gaussian_kernels import (
+    LEAST_EXPONENT,
+    fill_exponentials,
+    fill_logarithms,
+)
 
 SAFE = 1e-280
 """A sum of probabilities that is larger has lost nothing by underflow."""
+NEGLIGIBLE = 1e-292
+"""Smoothed probabilities that are smaller count as zero in earlier steps."""
 NEGLIGIBLE_LOG = -45.0
 """Terms of a sum that are smaller than its largest by this many nats are rounding errors."""
 UNDERFLOW_LOG = -746.0
 """The exponential function is zero in double precision below this."""
+FAR_BELOW_LOG = UNDERFLOW_LOG + float(np.log(SAFE))
+"""A number of smaller logarithm is still zero if it is divided by `SAFE`."""
 
 
 class PredecessorLists(NamedTuple):
@@ -63,6 +73,59 @@ def _exp(value: float) -> float:
 
 
 @_makes_no_arrays
+def _log(probability: Float, log_if_small: Float, index: int) -> float:
+    """Return the logarithm of an entry of `probability`, which is known if it is below `SAFE`."""
+    value = probability[index]
+    return float(np.log(value)) if value >= SAFE else float(log_if_small[index])
+
+
+@_makes_no_arrays
+def _sum_over_predecessors(
+    lists: PredecessorLists, block: int, control: int, source: Float, sums: Float
+) -> None:
+    """Fill `sums` (S,) with the numbers `source` (S,) after one block of a transition.
+
+    The block is applied along the first axis of the joint state.
+    """
+    levels, first_row, start, predecessor, probability, _ = lists
+    level_count = levels[block]
+    inner_count = np.int64(len(source)) // level_count  # joint levels of the other blocks
+    row = first_row[block] + control * level_count
+    if inner_count == 1:  # a single block: a shorter loop, because each state has few predecessors
+        end_entry = start[row]
+        for level in range(level_count):
+            first_entry = end_entry
+            end_entry = start[row + level + 1]
+            total = 0.0
+            for k in range(first_entry, end_entry):
+                total += source[predecessor[k]] * probability[k]
+            sums[level] = total
+        return
+    for level in range(level_count):
+        sums_of_level = sums[level * inner_count : (level + 1) * inner_count]
+        for i in range(inner_count):
+            sums_of_level[i] = 0.0
+        for k in range(start[row + level], start[row + level + 1]):
+            first = np.int64(predecessor[k]) * inner_count
+            before = source[first : first + inner_count]
+            for i in range(inner_count):
+                sums_of_level[i] += before[i] * probability[k]
+
+
+@_makes_no_arrays
+def _rotate_axes(level_count: int, numbers: Float, rotated: Float) -> None:
+    """Fill `rotated` (S,) with `numbers` (S,), whose first axis becomes the last one."""
+    inner_count = len(numbers) // level_count
+    if inner_count == 1:
+        for level in range(level_count):
+            rotated[level] = numbers[level]
+        return
+    for level in range(level_count):
+        for i in range(inner_count):
+            rotated[i * level_count + level] = numbers[level * inner_count + i]
+
+
+@_makes_no_arrays
 def apply_blocks(
     lists: PredecessorLists, control: int, before: Float, after: Float, work: Float
 ) -> None:
@@ -71,20 +134,10 @@ def apply_blocks(
     Each block is applied along the first axis of the joint state, which then becomes the last one.
     So after all blocks the axes are in their first order again. `work` (S,) is work space.
     """
-    levels, first_row, start, predecessor, probability, _ = lists
     source = before
-    for block in range(len(levels)):
-        level_count = levels[block]
-        inner_count = np.uint64(len(before) // level_count)  # joint levels of the other blocks
-        for level in range(level_count):
-            row = first_row[block] + control * level_count + level
-            for i in range(inner_count):
-                total = 0.0
-                for k in range(start[row], start[row + 1]):
-                    total += source[predecessor[k] * inner_count + i] * probability[k]
-                work[i * np.uint64(level_count) + np.uint64(level)] = total
-        for i in range(len(work)):
-            after[i] = work[i]
+    for block in range(len(lists.levels)):
+        _sum_over_predecessors(lists, block, control, source, work)
+        _rotate_axes(lists.levels[block], work, after)
         source = after
 
 
@@ -97,51 +150,57 @@ def _move_belief(
     after: Float,
     log_after: Float,
     work: Float,
+    bits: Index,
 ) -> None:
     """Move a belief by one transition: fill `after` (S,), and `log_after` with its logarithm.
 
-    The axes are treated as in `apply_blocks`. `work` (2, S) is work space.
+    The axes are treated as in `apply_blocks`. `work` (2, S) and `bits` (S,) are work space.
     """
-    levels, first_row, start, predecessor, probability, log_probability = lists
+    levels, first_row, start, predecessor, _, log_probability = lists
     source = before
     log_source = log_before
     for block in range(len(levels)):
         level_count = levels[block]
-        inner_count = np.uint64(len(before) // level_count)
-        for level in range(level_count):
+        inner_count = np.int64(len(before)) // level_count
+        _sum_over_predecessors(lists, block, control, source, work[0])
+        for target in range(len(before)):
+            if work[0, target] >= SAFE:
+                continue
+            # Terms may have underflowed. Log of the sum, from the logarithms of its terms,
+            # relative to the largest.
+            level = target // inner_count
+            other_levels = np.uint64(target - level * inner_count)
             row = first_row[block] + control * level_count + level
-            first_entry = start[row]
-            end_entry = start[row + 1]
-            for i in range(inner_count):
-                target = i * np.uint64(level_count) + np.uint64(level)
-                # Sum of probabilities, unless it may have underflowed.
-                total = 0.0
-                for k in range(first_entry, end_entry):
-                    total += source[predecessor[k] * inner_count + i] * probability[k]
-                if total >= SAFE:
-                    work[0, target] = total
-                    work[1, target] = np.log(total)
-                    continue
-                # Log of the sum, from the logarithms of its terms, relative to the largest.
-                largest = -np.inf
-                for k in range(first_entry, end_entry):
-                    log_term = log_source[predecessor[k] * inner_count + i] + log_probability[k]
-                    largest = max(largest, log_term)
-                total = 0.0
-                for k in range(first_entry, end_entry):
-                    log_term = log_source[predecessor[k] * inner_count + i] + log_probability[k]
-                    difference = log_term - largest
-                    if difference > NEGLIGIBLE_LOG:
-                        total += np.exp(difference)
-                if total > 1.0:
-                    largest += np.log(total)
-                work[0, target] = _exp(largest)
-                work[1, target] = largest
-        for i in range(len(before)):
-            after[i] = work[0, i]
-            log_after[i] = work[1, i]
+            largest = -np.inf
+            for k in range(start[row], start[row + 1]):
+                log_term = log_probability[k] + _log(
+                    source, log_source, predecessor[k] * np.uint64(inner_count) + other_levels
+                )
+                largest = max(largest, log_term)
+            total = 0.0
+            for k in range(start[row], start[row + 1]):
+                log_term = log_probability[k] + _log(
+                    source, log_source, predecessor[k] * np.uint64(inner_count) + other_levels
+                )
+                difference = log_term - largest
+                if difference == 0.0:
+                    total += 1.0
+                elif difference > NEGLIGIBLE_LOG:
+                    total += np.exp(difference)
+            if total > 1.0:
+                largest += np.log(total)
+            work[0, target] = _exp(largest)
+            work[1, target] = largest
+        _rotate_axes(level_count, work[0], after)
+        _rotate_axes(level_count, work[1], log_after)
         source = after
         log_source = log_after
+    # The logarithms of the other sums, which only the result needs.
+    for i in range(len(before)):
+        work[0, i] = max(after[i], SAFE)
+    fill_logarithms(work[0], work[1], bits)
+    for i in range(len(before)):
+        log_after[i] = work[1, i] if after[i] >= SAFE else log_after[i]
 
 
 @compiled
@@ -180,6 +239,8 @@ def forward_pass(
     twins, steps, state_count = log_likelihood.shape
     first = np.empty(state_count)
     work = np.empty((2, state_count))
+    bits = np.empty(state_count, np.int64)
+    power = bits.view(np.float64)
     for twin in range(twins):
         failed[twin] = -1
         for state in range(state_count):
@@ -197,7 +258,7 @@ def forward_pass(
                     log_now[state] = log_before[state]
             else:
                 _move_belief(
-                    lists, control_in_force, before, log_before, forecast_now, log_now, work
+                    lists, control_in_force, before, log_before, forecast_now, log_now, work, bits
                 )
             # Times the likelihood.
             largest = -np.inf
@@ -211,9 +272,13 @@ def forward_pass(
             # Normalisation.
             before = filtered[twin, t]
             log_before = log_now
+            for state in range(state_count):
+                work[0, state] = largest
+            fill_exponentials(log_now, work[0], work[1], bits)
             total = 0.0
             for state in range(state_count):
-                before[state] = _exp(log_now[state] - largest)
+                is_possible = log_now[state] - largest > LEAST_EXPONENT
+                before[state] = work[1, state] * power[state] if is_possible else 0.0
                 total += before[state]
             evidence = largest + np.log(total)
             log_evidence[twin, t] = evidence
@@ -238,9 +303,9 @@ def backward_pass(
 
         smoothed(i) = filtered(i) sum_j T(i, j) later(j) / forecast(j).
 
-    A smoothed probability that underflows never matters again: every entry of an earlier step is a
-    weighted mean of entries of the later one. So only the weights need care: if the forecast of a
-    possible state underflows, the step is taken in logarithms.
+    A smoothed probability below `NEGLIGIBLE` never matters again: every entry of an earlier step is
+    a weighted mean of entries of the later one. So only the weights need care: if the forecast of
+    another state underflows, the step is taken in logarithms.
 
     Parameters
     ----------
@@ -255,6 +320,7 @@ def backward_pass(
     forecast = np.empty(state_count)
     ratio = np.empty(state_count)
     work = np.empty((2, state_count))
+    bits = np.empty(state_count, np.int64)
     log_forecast = np.empty(state_count)
     log_ratio = np.empty(state_count)
     log_back = np.empty(state_count)
@@ -271,23 +337,25 @@ def backward_pass(
             underflows = False
             apply_blocks(forward, control_in_force, before, forecast, work[0])
             for state in range(state_count):
-                underflows |= later[state] > 0.0 and forecast[state] < SAFE
-                ratio[state] = later[state] / max(forecast[state], SAFE)
+                is_relevant = later[state] > NEGLIGIBLE
+                underflows |= is_relevant and forecast[state] < SAFE
+                ratio[state] = later[state] / max(forecast[state], SAFE) if is_relevant else 0.0
             # The ratio, carried back through the transition.
             largest = -np.inf
             if underflows:
                 _move_belief(
-                    forward, control_in_force, before, log_now, forecast, log_forecast, work
+                    forward, control_in_force, before, log_now, forecast, log_forecast, work, bits
                 )
                 for state in range(state_count):
-                    log_ratio[state] = -np.inf
-                    if later[state] > 0.0:
-                        log_ratio[state] = np.log(later[state]) - log_forecast[state]
+                    log_of_ratio = np.log(later[state]) - log_forecast[state]
+                    log_ratio[state] = log_of_ratio if later[state] > NEGLIGIBLE else -np.inf
                     largest = max(largest, log_ratio[state])
                 for state in range(state_count):
                     log_ratio[state] -= largest  # because the ratios themselves may overflow
                     ratio[state] = _exp(log_ratio[state])
-                _move_belief(backward, control_in_force, ratio, log_ratio, now, log_back, work)
+                _move_belief(
+                    backward, control_in_force, ratio, log_ratio, now, log_back, work, bits
+                )
             else:
                 apply_blocks(backward, control_in_force, ratio, now, work[0])
             # Times the filtered belief, and normalisation.
@@ -297,6 +365,8 @@ def backward_pass(
                     now[state] = _exp(log_now[state] + (log_back[state] + largest))
                 elif before[state] >= SAFE:
                     now[state] *= before[state]
+                elif log_now[state] < FAR_BELOW_LOG:
+                    now[state] = 0.0
                 elif now[state] > 0.0:
                     now[state] = _exp(log_now[state] + np.log(now[state]))
                 total += now[state]
