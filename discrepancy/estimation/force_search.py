@@ -81,9 +81,9 @@ class ForceSearch:
         """Return the search in thinned records; None if they are short or cannot be thinned."""
         if self.ported.trial_set.sample_count < THINNED_AT_LEAST * MOST_THINNED_SAMPLES:
             return None
-        thinned = ForceSearch(self.ported.problem_with_laws, MOST_THINNED_SAMPLES)
-        is_thinned = any(trial.trial.stride > 1 for trial in thinned.best_port_estimate.trials)
-        return thinned if is_thinned else None
+        problem = self.ported.problem_with_laws
+        thinned = PortedProblem(problem, MOST_THINNED_SAMPLES)
+        return ForceSearch(problem, MOST_THINNED_SAMPLES) if thinned.trial_set.is_thinned else None
 
     def _estimates_of_ports(self) -> dict[str, Estimate]:
         """Return the missing force at each port alone, by the name of the port.
@@ -318,11 +318,14 @@ class ForceSearch:
     ) -> Estimate | None:
         """Return an estimate that begins along the motion of the laws alone.
 
-        None if the laws do not explain the motion: they are not possible, or the missing force
-        beside them is more than `LARGEST_RATIO_BESIDE_LAWS` of that without effects.
+        None if the laws do not explain the motion: they are not possible, or leave a force that is
+        more than `LARGEST_RATIO_BESIDE_LAWS` of that without effects.
         """
         estimate = estimator.follow_laws(laws, replace(start, processes=estimator.small_processes))
-        if estimate is None or estimator.missing_force_ratio(estimate) > LARGEST_RATIO_BESIDE_LAWS:
+        if estimate is None:
+            return None
+        missing_force_ratio = estimator.missing_force_ratio(estimate)
+        if not estimate.leaves_no_force and missing_force_ratio > LARGEST_RATIO_BESIDE_LAWS:
             return None
         return self.estimate_about_own_values(estimate)
 

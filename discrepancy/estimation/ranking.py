@@ -32,6 +32,11 @@ BEAM_WIDTHS = (4, 2, 2)
 """Numbers of these rough estimates that are then estimated in full."""
 ESTIMATED_RANGE = 60.0
 """Difference to the best score above which a hypothesis is not estimated in full [nat]."""
+RANGE_BESIDE_NO_FORCE = 6.0
+"""The same difference where the best hypothesis leaves no force [nat]: what is added is then small,
+and its rough estimate nearly exact."""
+LEAST_LOSS = 0.5
+"""Evidence by which an estimate must be below its rough one to count as another optimum [nat]."""
 MOST_SETTLING_ESTIMATES, LEAST_SETTLING_RISE = 4, 2.0
 """Largest number of times that the estimate of the best hypothesis is repeated, and the rise of its
 evidence [nat] below which it is not repeated again."""
@@ -228,10 +233,8 @@ class _Ranking:
                 break
             # where nothing is left to explain, another effect cannot explain more
             best_estimate = self.best
-            if (
-                best_estimate.leaves_no_force
-                and self.score(rough_estimate) < self.score(best_estimate) - ESTIMATED_RANGE
-            ):
+            least_score = self.score(best_estimate) - RANGE_BESIDE_NO_FORCE
+            if best_estimate.leaves_no_force and self.score(rough_estimate) < least_score:
                 break
             candidate = rough_estimate.candidate
             self.on_progress(f"estimating {candidate.description} together with the motion")
@@ -240,7 +243,8 @@ class _Ranking:
                 self.record(estimate)
             # With the large missing force of the base, a law whose force hardly changes may be lost
             # to it: begin also with the smaller missing force of the rough estimate.
-            if self.by_effects[candidate.key] is rough_estimate:
+            least_evidence = rough_estimate.log_evidence - LEAST_LOSS
+            if estimate is None or estimate.log_evidence < least_evidence:
                 self.record(self.search.estimate_about_own_values(rough_estimate))
             self.estimated_in_full.add(candidate.key)
 

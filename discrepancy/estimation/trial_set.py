@@ -57,6 +57,11 @@ class TrialSet:
         trials = [self.problem.trials[number].trial for number in self.trial_indices]
         return sum(len(trial.time) for trial in trials if trial.is_dynamic)
 
+    @property
+    def is_thinned(self) -> bool:
+        """Whether any trial in motion is thinned."""
+        return any(stride > 1 for stride in self._strides.values())
+
     @cached_property
     def _strides(self) -> dict[int, int]:
         """The stride with which each trial in motion is thinned, by the number of the trial.
