@@ -48,7 +48,9 @@ def decide_on_noise(case: NoiseCase[HypothesisT]) -> VerdictOutcome:
         return nothing_missing_verdict(case)
     # several sets explain the readings about equally well
     if not case.is_sure_enough_to_name:
-        return common_effects_verdict(case) or undecided_verdict(case)
+        return (
+            common_effects_verdict(case) or common_family_verdict(case) or undecided_verdict(case)
+        )
     # one set is sure: name it, or its family if the shape of its law is free
     if case.leading_fit.candidate.has_free_shape:
         if case.tested_set.fails:
@@ -210,6 +212,27 @@ def common_effects_verdict(case: NoiseCase[HypothesisT]) -> VerdictOutcome | Non
         return None
     outcome = decide_on_noise(common_case)
     return outcome if outcome.verdict.kind is VerdictKind.NAMED else None
+
+
+def common_family_verdict(case: NoiseCase[HypothesisT]) -> VerdictOutcome | None:
+    """Return the verdict that names the family to which each probable set belongs.
+
+    A law of free shape contains the named laws of its family: quadratic drag and damping by a free
+    power of the speed are not two explanations. None is returned if a probable set is not a single
+    effect of the family, if none of them has a free shape, or if the family cannot be named.
+    """
+    free_set, families = None, set()
+    for names in case.probable_sets:
+        terms = case.comparison.best_of_set(names).candidate.terms
+        families.add(tuple(term.effect.family for term in terms))
+        if free_set is None and len(terms) == 1 and terms[0].free_shape:
+            free_set = names
+    if free_set is None or len(families) > 1:
+        return None
+    family_case = NoiseCase(case.comparison, case.probabilities, free_set, case.noise)
+    if not family_case.is_sure_enough_to_name or family_case.tested_set.fails:
+        return None
+    return family_verdict(family_case, family_case.tested_set)
 
 
 class _Member(NamedTuple):

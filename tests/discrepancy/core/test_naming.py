@@ -10,9 +10,14 @@ import pytest
 from discrepancy.campaign.records import NoiseRecord
 from discrepancy.errors import SENTENCES
 from discrepancy.fits.candidate import Candidate, EffectTerm
+from discrepancy.fits.fitting import fit_free_shape
 from discrepancy.judgement.decide import comparison_of, reach_verdict
 from discrepancy.judgement.noise_case import NoiseCase
-from discrepancy.judgement.noise_verdict import common_effects_verdict, undecided_verdict
+from discrepancy.judgement.noise_verdict import (
+    common_effects_verdict,
+    common_family_verdict,
+    undecided_verdict,
+)
 from discrepancy.judgement.remainder_verdict import not_named_sentence
 from discrepancy.judgement.remarks import look_alike_remark, verdict_with_untested_effects
 from discrepancy.judgement.simulation_comparison import SimulationComparison
@@ -435,6 +440,23 @@ def test_a_law_of_free_shape_beside_another_effect_is_no_rival_of_a_name(frictio
     del friction_search.exact_fits[fit.candidate.key]
     assert fit.candidate.identifiers not in probabilities
     assert FRICTION_ALONE in probabilities
+
+
+def test_a_law_and_a_free_shape_of_its_family_are_the_family(friction_search):
+    """Damping by a free power of the speed contains quadratic damping: they are no two explanations."""
+    problem = friction_search.problem
+    damping = EffectTerm(kit.chosen("quadratic_damping")[0], "joint")
+    friction_fit = SimulationComparison(friction_search).best_of_set(FRICTION_ALONE)
+    free_fit = fit_free_shape(problem, friction_fit, 0)
+    fits = [friction_search.record_fit(fit, exact=True) for fit in (kit.fitted(problem, damping), free_fit)]
+    damping_alone, family = (fit.candidate.identifiers for fit in fits)
+    named = common_family_verdict(case_of(friction_search, {damping_alone: 0.5, family: 0.5}))
+    beside_a_cell = common_family_verdict(case_of(friction_search, {("load_cell",): 0.5, family: 0.5}))
+    for fit in fits:
+        del friction_search.exact_fits[fit.candidate.key]
+    assert named.verdict.kind is VerdictKind.FAMILY
+    assert named.verdict.family == damping.effect.family
+    assert beside_a_cell is None
 
 
 def test_nothing_is_named_where_the_model_without_effects_is_probable(friction_search):
