@@ -56,7 +56,11 @@ def decide_on_remainder(
         return unexplained_outcome(comparison, noise_verdict, best_hypothesis, reason)
     # conditions that a name must fulfil
     if comparison.enlarges_error(best_hypothesis):
-        mentioned_hypothesis = comparison.more_probable_rival(best_hypothesis) or best_hypothesis
+        rival = comparison.more_probable_rival(best_hypothesis)
+        explains_most = rival is not None and (
+            comparison.held_out_or_fitted_share(rival).value >= SEARCH.least_gap_share
+        )
+        mentioned_hypothesis = rival if explains_most else best_hypothesis
         return unexplained_outcome(comparison, noise_verdict, mentioned_hypothesis)
     remaining_error = comparison.reason_of_remaining_error(best_hypothesis)
     if remaining_error:
