@@ -108,8 +108,13 @@ class NamedEffect:
 
     @property
     def place_in_words(self) -> str:
-        """The place, "all channels" for the place "*"."""
-        return "all channels" if self.place == EVERY_CHANNEL else self.place
+        """The place as a reader is told it."""
+        return place_in_words(self.place)
+
+
+def place_in_words(place: str) -> str:
+    """Return a place as a reader is told it: "all channels" for "*"."""
+    return "all channels" if place == EVERY_CHANNEL else place
 
 
 def effect_label(identifier: str, place: str, *, free_shape: bool = False) -> str:
@@ -308,7 +313,7 @@ class ForceAtPort:
         """What the force depends on, as a clause of a sentence."""
         if not self.ordered_by:
             return f"it follows none of {listing(map(as_noun, self.orders))}"
-        followed = listing(map(as_noun, self.ordered_by))
+        followed = listing(map(as_noun, self.ordered_by), "or")
         clause = f"{self.followed_percent} % of its variance follows {followed}"
         if len(self.ordered_by) == 1 and self.ordered_by[0].startswith(RATE_OF):
             return f"{clause}, as if it acted later or earlier than was recorded"

@@ -27,10 +27,21 @@ not the effect [nat]."""
 
 
 class NamedTest(NamedTuple):
-    """The name of a statistical test, as a verdict prints it, and its p-value."""
+    """A statistical test of a fit.
+
+    Attributes
+    ----------
+    name : str
+        What is tested.
+    p_value : float
+        Its p-value.
+    failure : str
+        The sentence of a verdict if the test fails.
+    """
 
     name: str
     p_value: float
+    failure: str
 
 
 # ---------------------------------------------------------------- absolute fit
@@ -56,8 +67,7 @@ def check_absolute_fit(problem: Problem, fit: CandidateFit) -> Gate:
     worst_test = min(tests, key=lambda test: test.p_value)
     corrected_p_value = min(worst_test.p_value * len(tests), 1.0)
     if corrected_p_value < ABSOLUTE_FIT_LEVEL:
-        reason = f"The residuals are larger than noise and priors allow: {worst_test.name}."
-        return _absolute_fit_gate(False, corrected_p_value, reason)
+        return _absolute_fit_gate(False, corrected_p_value, worst_test.failure)
     if not any(test.name.startswith("variance") for test in tests):
         reason = (
             f"{_lacking_for_variance(problem)}: only the priors and the whiteness of the residuals "
@@ -104,14 +114,17 @@ def absolute_fit_tests(problem: Problem, fit: CandidateFit) -> list[NamedTest]:
         p_value = noise_tests.variance_p_value(
             mean_square, residual_freedom[channel], record_freedom[channel]
         )
-        tests.append(NamedTest(f"variance of {problem.channel_names[channel]}", p_value))
+        name = problem.channel_names[channel]
+        failure = f"The residuals of {name} are larger than its noise record allows."
+        tests.append(NamedTest(f"variance of {name}", p_value, failure))
     if len(testable_channels) > 1:
         p_value = noise_tests.pooled_variance_p_value(
             np.array([test.p_value for test in tests]),
             residual_freedom[testable_channels],
             record_freedom[testable_channels],
         )
-        tests.append(NamedTest("variance of all channels", p_value))
+        failure = "The residuals of all channels are larger than their noise records allow."
+        tests.append(NamedTest("variance of all channels", p_value, failure))
     return [*tests, *prior_tests(problem, fit), *whiteness_tests(problem, fit)]
 
 
@@ -154,16 +167,19 @@ def prior_tests(problem: Problem, fit: CandidateFit) -> list[NamedTest]:
         p_value = float(
             chi2.sf(parameter_deviations @ parameter_deviations, parameter_deviations.size)
         )
-        tests.append(NamedTest("calibrated parameters outside their priors", p_value))
+        failure = "The fit moves calibrated parameters far outside their priors."
+        tests.append(NamedTest("calibrated parameters", p_value, failure))
         # beyond the end of its range a parameter would fit better: the point is no maximum, and
         # Laplace's approximation of the evidence is wrong
         low, high = layout.bounds
         is_at_end = (fit.point.shared <= low) | (fit.point.shared >= high)
         if is_at_end[: layout.parameter_count].any():
-            tests.append(NamedTest("a calibrated parameter at the end of its range", 0.0))
+            failure = "The fit moves a calibrated parameter to the end of its range."
+            tests.append(NamedTest("ranges of calibrated parameters", 0.0, failure))
     if gain_deviations.size:
         p_value = float(chi2.sf(gain_deviations @ gain_deviations, gain_deviations.size))
-        tests.append(NamedTest("gains outside their priors", p_value))
+        failure = "The fit moves gains far outside their priors."
+        tests.append(NamedTest("gains", p_value, failure))
     for term, values in fit.candidate.split_by_term(fit.effect):
         # the values of free shape parameters follow those of the effect, and are not tested
         for parameter, scaled_value in zip(term.effect.parameters, values.tolist(), strict=False):
@@ -172,10 +188,11 @@ def prior_tests(problem: Problem, fit: CandidateFit) -> list[NamedTest]:
             is_gain = parameter.name == GAIN
             if is_uniform or (parameter.magnitude and not is_gain):
                 continue
-            name = f"{parameter.name} of {term.effect.identifier} outside its prior"
+            name = f"{parameter.name} of {term.effect.identifier}"
+            failure = f"The fit moves the {name} far outside its prior"
             if is_gain:
-                name += f" ({100.0 * parameter.prior.value(scaled_value):+.3g} %)"
-            tests.append(NamedTest(name, float(chi2.sf(scaled_value**2, 1))))
+                failure += f" ({100.0 * parameter.prior.value(scaled_value):+.3g} %)"
+            tests.append(NamedTest(name, float(chi2.sf(scaled_value**2, 1)), f"{failure}."))
     return tests
 
 
@@ -193,8 +210,9 @@ def whiteness_tests(problem: Problem, fit: CandidateFit) -> list[NamedTest]:
             continue
         records = residual_records(problem, fit, channel)
         if records:
-            name = f"whiteness of {problem.channel_names[channel]}"
-            tests.append(NamedTest(name, whiteness_p_value(records)))
+            name = problem.channel_names[channel]
+            failure = f"The residuals of {name} are not white noise."
+            tests.append(NamedTest(f"whiteness of {name}", whiteness_p_value(records), failure))
     return tests
 
 

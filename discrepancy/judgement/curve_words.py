@@ -86,13 +86,13 @@ def curve_in_words(curve: TableStiffness | TableDamping, force_unit: str) -> str
             dead_band = _stretch_without_force(points, forces - line.force_at(points))
             forces = forces if dead_band is None else forces - line.force_at(points)
             line_text = (
-                f"apart from a line of {number(line.slope)} {force_unit}/{motion_unit}, as an "
-                "error of the stiffness gives, "
+                f" (without a line of {number(line.slope)} {force_unit}/{motion_unit}, which an "
+                "error of the stiffness would give)"
             )
     if dead_band is None:
         return _growth("displacement", points, forces, force_unit, motion_unit)
     low, high = dead_band
-    slopes = []
+    slopes, slope_texts = [], []
     is_below, is_above = points <= low, points >= high
     # a force at one end that is small beside that at the other is none, either
     least_force = ONE_SIDED * np.abs(forces).max()
@@ -102,14 +102,20 @@ def curve_in_words(curve: TableStiffness | TableDamping, force_unit: str) -> str
         high = float(points[-1])
     if low > points[0]:
         slope, low = _line_to_zero(points, forces, is_below)
-        slopes.append(f"{number(slope)} {force_unit}/{motion_unit} below")
+        slopes.append(slope)
+        slope_texts.append(f"{number(slope)} {force_unit}/{motion_unit} below")
     if high < points[-1]:
         slope, high = _line_to_zero(points, forces, is_above)
-        slopes.append(f"{number(slope)} {force_unit}/{motion_unit} above")
+        slopes.append(slope)
+        slope_texts.append(f"{number(slope)} {force_unit}/{motion_unit} above")
     if low >= high:  # the forces beyond the stretch are no lines that begin at its ends
         return _growth("displacement", points, forces, force_unit, motion_unit)
     begin, end = _position_text(low, motion_unit), _position_text(high, motion_unit)
-    return f"{line_text}it is zero from {begin} to {end}, with a slope of {listing(slopes)}"
+    likeness = ""
+    if min(slopes) > 0.0:
+        likeness = ", as at a stop" if len(slopes) == 1 else ", as at two stops"
+    slope_text = listing(slope_texts)
+    return f"it is zero from {begin} to {end}, with a slope of {slope_text}{likeness}{line_text}"
 
 
 class _Line(NamedTuple):

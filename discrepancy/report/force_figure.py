@@ -40,16 +40,18 @@ def missing_force_figure(missing: MissingForce) -> Figure:
     has the force that remains beside it.
     """
     variables = _variables(missing)
+    noun, *_ = port_motion_units(missing.at_port)
+    title = f"missing {noun}"
     if missing.law:
         figure, ((first, second), (left, over_time)) = new_panels(
             2, 2, 4.2, width_ratios=(WIDE, 1.0)
         )
         panels = [first, second, left, over_time]
-        titles = ["missing force", "missing force", "remaining force", "missing force"]
+        titles = [title, title, f"remaining {noun}", title]
     else:
         figure, ((first, second, over_time),) = new_panels(1, 3, 2.4, width_ratios=(WIDE, 1.0, 1.0))
         panels = [first, second, over_time]
-        titles = ["missing force"] * 3
+        titles = [title] * 3
     _draw_over(first, missing, variables[0], "force")
     _draw_free_shape(first, missing, variables[0])
     _draw_over(second, missing, variables[1], "force")
@@ -57,34 +59,38 @@ def missing_force_figure(missing: MissingForce) -> Figure:
         _draw_over(left, missing, variables[0], "left")
         left.set_ylim(first.get_ylim())
     _draw_over_time(over_time, missing)
-    name, *_ = port_motion_units(missing.at_port)
-    for axes, letter, title in zip(panels, "abcd", titles, strict=False):
+    for axes, letter, panel_title in zip(panels, "abcd", titles, strict=False):
         axes.axhline(0.0, color=style.REFERENCE, lw=0.6, zorder=0)
         axes.locator_params(axis="x", nbins=5)  # the integral of a state may have six digits
-        axes.set_ylabel(f"{name}, {missing.at_port.unit}")
-        style.panel_label(axes, letter, title)
+        axes.set_ylabel(f"{noun}, {missing.at_port.unit}")
+        style.panel_label(axes, letter, panel_title)
     handles, labels = first.get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside upper right", ncols=3, markerscale=3.0)
     return figure
 
 
 def _variables(missing: MissingForce) -> tuple[Variable, Variable]:
-    """Return the variable that the force depends on, and another motion of its port.
+    """Return the variable that the force depends on, and another one.
 
-    If it depends on neither of them alone nor on an input, they are displacement and velocity.
+    If it depends on neither motion of its port alone nor on an input, they are displacement and
+    velocity. At a port of a state they are the state, and the first recorded input or the integral
+    of the state.
     """
     _, displacement_unit, speed_unit = port_motion_units(missing.at_port)
-    displacement = Variable("position", f"displacement, {displacement_unit}")
-    speed = Variable("speed", f"velocity, {speed_unit}")
+    names = dict.fromkeys(name for course in missing.courses for name in course.variables)
+    recorded = {name: Variable(name, name.removeprefix("the ")) for name in names}
+    first = Variable("position", f"displacement, {displacement_unit}")
+    second = Variable("speed", f"velocity, {speed_unit}")
     if not displacement_unit:
-        displacement = Variable("position", "integral of the state")
-        speed = Variable("speed", f"state, {speed_unit}")
-    followed = next(iter(missing.at_port.ordered_by), "displacement")
-    if followed in ("velocity", "state"):
-        return speed, displacement
-    if any(followed in course.variables for course in missing.courses):
-        return Variable(followed, followed.removeprefix("the ")), displacement
-    return displacement, speed
+        integral = Variable("position", "integral of the state")
+        first = Variable("speed", f"state, {speed_unit}")
+        second = next(iter(recorded.values()), integral)
+    followed = next(iter(missing.at_port.ordered_by), "")
+    if followed == "velocity":
+        return second, first
+    if followed in recorded:
+        return recorded[followed], first
+    return first, second
 
 
 def _joined(missing: MissingForce, variable: Variable, series: str) -> tuple[FloatArray, ...]:

@@ -39,8 +39,11 @@ class Answer(NamedTuple):
     certainty: str
 
 
-def levels_table(investigation: Investigation) -> Table:
-    """Return the table of the four questions; without rows if the data are at fault."""
+def levels_table(investigation: Investigation, *, next_step: str = "") -> Table:
+    """Return the table of the four questions; without rows if the data are at fault.
+
+    `next_step` is the answer of a last row on what to do next; without it there is no such row.
+    """
     verdict = investigation.verdict
     shape = ""
     if verdict.kind is VerdictKind.UNEXPLAINED:
@@ -50,9 +53,12 @@ def levels_table(investigation: Investigation) -> Table:
         text_cells("answer", lambda answer: answer.text),
         text_cells("how sure", lambda answer: answer.certainty),
     ]
+    rows = answers(verdict, shape)
+    if rows and next_step:
+        rows.append(Answer("What next?", next_step, ""))
     return table_of_records(
         columns,
-        answers(verdict, shape),
+        rows,
         title="What is known",
         caption=(
             "Probabilities are among what was compared: a missing force against none, its port "

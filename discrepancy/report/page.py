@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from math import isfinite
 
+from discrepancy.application import has_applicable_effects
 from discrepancy.catalogue.entry import Effect
 from discrepancy.judgement.closed_share import (
     channels_by_error,
@@ -118,10 +119,9 @@ def _outcome(content: ReportInput) -> list[Block]:
         Notice(hidden),
         Highlights(errors),
         "" if errors else error_sentence(investigation),
-        levels_table(investigation),
+        levels_table(investigation, next_step=_next_step(investigation)),
         left_over_sentence(verdict),
         "" if verdict.kind in KINDS_WITHOUT_GAP else verdict.reasons,
-        _next_test_sentence(verdict),
         Fold("What this verdict means", explanations),
     ]
 
@@ -142,7 +142,9 @@ def _errors_before_and_after(investigation: Investigation) -> list[tuple[str, st
     explained = "taken away" if proof.closed.value >= 0.0 else "added"
     meaning = f"of the mean square error in {role} trials is {explained}"
     if investigation.verdict.kind not in KINDS_WITH_NAME:
-        meaning += f" by {added_label(investigation)}, which is not named"
+        is_group = investigation.verdict.kind is VerdictKind.GROUP
+        clause = "the most probable of them" if is_group else "which is not named"
+        meaning += f" by {added_label(investigation)}, {clause}"
     values.append((percent_with_interval(proof.closed), meaning))
     return values
 
@@ -157,11 +159,16 @@ def left_over_sentence(verdict: Verdict) -> str:
     return left_sentence(verdict.force) or remainders_sentence(verdict)
 
 
-def _next_test_sentence(verdict: Verdict) -> str:
-    """Return the sentence on the test that would decide most; empty without any."""
-    if not verdict.next_experiments:
-        return ""
-    return f"Measure next: {verdict.next_experiments[0].description}"
+def _next_step(investigation: Investigation) -> str:
+    """Return what to do next: the test that would decide most, or to apply what is named."""
+    verdict = investigation.verdict
+    if verdict.next_experiments:
+        return f"measure: {verdict.next_experiments[0].description.rstrip('.')}"
+    if verdict.kind is VerdictKind.UNEXPLAINED:
+        return "compare the shape in the picture with what you know of the rig"
+    if has_applicable_effects(verdict, investigation.proof):
+        return "add it to the model: uav-twin discrepancy apply"
+    return ""
 
 
 def sizes_sentence(content: ReportInput) -> str:

@@ -4,7 +4,7 @@ import re
 from collections.abc import Iterable
 from math import isfinite, isnan
 
-from discrepancy.verdict import Hypothesis, ParameterEstimate, VerdictKind
+from discrepancy.verdict import Hypothesis, ParameterEstimate, VerdictKind, place_in_words
 from discrepancy.workflow import Investigation
 from reporting.pages.page_words import Words
 from reporting.words import between, rounded
@@ -61,7 +61,7 @@ def _effects_label(effects: Iterable[tuple[str, str, bool]]) -> str:
     """Return the label of effects: their names, places and a mark for a free shape, joined by +."""
     labels = []
     for name, place, has_free_shape in effects:
-        marks = [place] if place else []
+        marks = [place_in_words(place)] if place else []
         if has_free_shape:
             marks.append("free shape")
         labels.append(f"{name} ({', '.join(marks)})" if marks else name)

@@ -230,6 +230,6 @@ def test_a_channel_whose_noise_record_is_not_white_has_no_test_of_whiteness():
     channels = {**problem.campaign.channels, name: replace(channel, noise=record)}
     coloured = kit.problem_of(replace(problem.campaign, channels=channels), problem.model)
     before, after = (
-        {label for label, _ in whiteness_tests(item, kit.fitted(item))} for item in (problem, coloured)
+        {test.name for test in whiteness_tests(item, kit.fitted(item))} for item in (problem, coloured)
     )
     assert before - after == {f"whiteness of {name}"}

@@ -17,11 +17,11 @@ DISPLACEMENTS = np.linspace(-0.02, 0.02, 49)
     [
         (
             400.0 * np.maximum(DISPLACEMENTS - 0.007, 0.0),
-            "it is zero from −20 mm to 7 mm, with a slope of 400 N/m above",
+            "it is zero from −20 mm to 7 mm, with a slope of 400 N/m above, as at a stop",
         ),
         (
             300.0 * np.sign(DISPLACEMENTS) * np.maximum(np.abs(DISPLACEMENTS) - 0.005, 0.0),
-            "it is zero from −5 mm to 5 mm, with a slope of 300 N/m below and 300 N/m above",
+            "it is zero from −5 mm to 5 mm, with a slope of 300 N/m below and 300 N/m above, as at two stops",
         ),
         (
             1e6 * DISPLACEMENTS**3,
@@ -34,8 +34,8 @@ DISPLACEMENTS = np.linspace(-0.02, 0.02, 49)
         ),
         (
             60.0 * np.maximum(DISPLACEMENTS - 0.01, 0.0) - 9.0 * DISPLACEMENTS,
-            "apart from a line of −9 N/m, as an error of the stiffness gives, it is zero from "
-            "−20 mm to 10 mm, with a slope of 60 N/m above",
+            "it is zero from −20 mm to 10 mm, with a slope of 60 N/m above, as at a stop (without a "
+            "line of −9 N/m, which an error of the stiffness would give)",
         ),
         (
             np.where(DISPLACEMENTS < -0.005, -0.08, -40.0 * np.maximum(DISPLACEMENTS - 0.0075, 0.0)),
@@ -62,7 +62,7 @@ def test_a_curve_is_told_by_its_shape(forces, words):
 def test_the_motion_of_a_moment_is_told_in_radians():
     moments = 2.0 * np.maximum(DISPLACEMENTS - 0.01, 0.0)
     assert curve_in_words(TableStiffness("p", tuple(DISPLACEMENTS), tuple(moments)), "N m") == (
-        "it is zero from −0.02 rad to 0.01 rad, with a slope of 2 N m/rad above"
+        "it is zero from −0.02 rad to 0.01 rad, with a slope of 2 N m/rad above, as at a stop"
     )
 
 

@@ -148,7 +148,7 @@ def test_gates_say_what_they_compare(drag, page):
 
 def test_a_group_is_no_name(drag):
     page = page_of(drag, kind=VerdictKind.GROUP)
-    assert f"is taken away by {added_label(drag)}, which is not named" in page
+    assert f"is taken away by {added_label(drag)}, the most probable of them" in page
 
 
 def test_a_proof_without_a_gap_says_so(drag):
