@@ -19,10 +19,17 @@ from reporting.arrays import AnyArray, Float, Index, nan_where_masked, product_o
 from reporting.choices import require_one_of
 from reporting.words import brief
 from twin_master.errors import InvalidModelError, InvalidObservationError
-from twin_master.network.estimator import Carried, Estimate, Estimator, Notice, SensorModel
+from twin_master.network.estimator import (
+    Carried,
+    Estimate,
+    Estimator,
+    KeptStep,
+    KeptSteps,
+    Notice,
+    SensorModel,
+)
 from twin_master.network.graphical_model import GraphicalModel
 from twin_master.network.inference import NO_CONTROL, ExactFilter, Predicted, predict
-from twin_master.network.kept_steps import KeptStep, KeptSteps
 from twin_master.network.planner import BeliefPolicy, Hold, RiskPolicy
 from twin_master.network.transition import TransitionModel, checked_beliefs, checked_controls
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from twin_master.network.estimator import CHECKPOINT_STEPS, RECENT_STEPS
 from twin_master.network.graphical_model import GraphicalModel, worsening_table
-from twin_master.network.kept_steps import CHECKPOINT_STEPS, RECENT_STEPS
 from uav_twin import ExactFilter, GaussianSensorModel, Twin, WatchfulEstimator
 
 Float = NDArray[np.float64]
