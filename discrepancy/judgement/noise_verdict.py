@@ -221,18 +221,30 @@ def common_family_verdict(case: NoiseCase[HypothesisT]) -> VerdictOutcome | None
     power of the speed are not two explanations. None is returned if a probable set is not a single
     effect of the family, if none of them has a free shape, or if the family cannot be named.
     """
-    free_set, families = None, set()
+    free_set: EffectSet | None = None
+    families: set[tuple[str, ...]] = set()
+    named_laws: list[NamedEffect] = []
     for names in case.probable_sets:
-        terms = case.comparison.best_of_set(names).candidate.terms
+        hypothesis = case.comparison.best_of_set(names)
+        terms = hypothesis.candidate.terms
         families.add(tuple(term.effect.family for term in terms))
-        if free_set is None and len(terms) == 1 and terms[0].free_shape:
+        if not hypothesis.candidate.has_free_shape:
+            named_laws.extend(named_effects(case.problem, hypothesis))
+        elif free_set is None and len(terms) == 1:
             free_set = names
     if free_set is None or len(families) > 1:
         return None
     family_case = NoiseCase(case.comparison, case.probabilities, free_set, case.noise)
     if not family_case.is_sure_enough_to_name or family_case.tested_set.fails:
         return None
-    return family_verdict(family_case, family_case.tested_set)
+    outcome = family_verdict(family_case, family_case.tested_set)
+    if not named_laws:
+        return outcome
+    reason = (
+        f"{capital(effects_text(named_laws))} needs no fitted exponent, and explains the readings "
+        "about as well."
+    )
+    return outcome._replace(verdict=outcome.verdict.with_reasons(reason))
 
 
 class _Member(NamedTuple):

@@ -456,6 +456,7 @@ def test_a_law_and_a_free_shape_of_its_family_are_the_family(friction_search):
         del friction_search.exact_fits[fit.candidate.key]
     assert named.verdict.kind is VerdictKind.FAMILY
     assert named.verdict.family == damping.effect.family
+    assert "at joint needs no fitted exponent" in named.verdict.reasons
     assert beside_a_cell is None
 
 
