@@ -38,7 +38,9 @@ from reporting.words import listing
 KINDS = (*TrialKind, NOISE)
 """Kinds of a file: those of trials, and samples at rest."""
 _RECORDED_IN_TIME = (TrialKind.RINGDOWN, TrialKind.FORCED, TrialKind.DRIVEN, NOISE)
-_NOT_TITLE = re.compile(r".*\.xls[mx]?#|\.[^.]*$")
+_WORKBOOK_OR_SUFFIX = re.compile(r".*\.xls[mx]?#|\.[^.]*$")
+"""What the name of a trial leaves out of that of its file: the workbook before the name of a sheet,
+as in `book.xlsx#sheet`, or else the suffix."""
 
 
 class LaboratoryImport:
@@ -385,24 +387,29 @@ class LaboratoryImport:
     def _trial_table(self, file: str) -> dict[str, Any]:
         """Return the table `[[trial]]` that `campaign.toml` needs for the trial in a file.
 
-        A ring-down from a force becomes a forced trial whose force is cut off.
+        A ring-down from a force becomes a forced trial: it begins at rest under the force, which
+        `_text_table` adds to its table, and which drops to zero at the release in one step.
         """
-        load_places = self.answers.get("load-place", {})
-        hold = None
+        # the course of the force between its samples
+        course_of_force = None
         for column in self.columns:
             is_force = column.sheet.name == file and column.role == "force"
             if is_force and self._is_sampled_load(column):
-                hold = self.holds[column.head]
+                course_of_force = self.holds[column.head]
                 break
+        load_places = self.answers.get("load-place", {})
+        place_in_all_files = load_places.get("")  # an answer without a file is about all of them
         optional_keys = {
             "kind": self.kinds[file],
             "release": self.releases.get(file),
-            "load_place": load_places.get(file, load_places.get("")),
-            "hold": hold,
+            "load_place": load_places.get(file, place_in_all_files),
+            "hold": course_of_force,
             "begins": self.begins[file],
             "held_out": self.held_out[file] or None,
         }
-        if self._holding_force(file) is not None:
+        if self._released_force(file) is not None:
+            # of zero order, so that the force is not a ramp between the last sample before the
+            # release and the first one after it; settled is at rest under the force
             optional_keys |= {
                 "kind": TrialKind.FORCED.value,
                 "release": None,
@@ -410,10 +417,10 @@ class LaboratoryImport:
                 "begins": Start.SETTLED.value,
             }
         stated_keys = {key: value for key, value in optional_keys.items() if value is not None}
-        return {"name": _NOT_TITLE.sub("", file, count=1), "file": file, **stated_keys}
+        return {"name": _WORKBOOK_OR_SUFFIX.sub("", file, count=1), "file": file, **stated_keys}
 
-    def _holding_force(self, file: str) -> float | None:
-        """Return the force [N] that held the structure; None unless a ring-down began from one."""
+    def _released_force(self, file: str) -> float | None:
+        """Return the force [N] from which a ring-down was released; None if there was none."""
         return self.releases.get(file, {}).get("force")
 
     def merge_clocks_of(self, sheet: Sheet) -> MergedTable | None:
@@ -481,11 +488,11 @@ class LaboratoryImport:
             for column in used_columns:
                 columns[column.title] = column.cells_in_si(self.decimals[sheet.name])
         table = TextTable(sheet.name, columns, lines, TABLE_ERRORS)
-        holding_force = self._holding_force(sheet.name)
-        if holding_force is None:
+        released_force = self._released_force(sheet.name)
+        if released_force is None:
             return table
         channels = [column.title for column in used_columns if column.is_channel]
-        return table_of_release_by_force(table, channels, holding_force)
+        return table_of_release_by_force(table, channels, released_force)
 
     def _origin_sentence(self, sheet: Sheet) -> str:
         """Return the sentence on the file of a table, its columns, and its clocks."""

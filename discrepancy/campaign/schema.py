@@ -124,18 +124,20 @@ ChannelInFile = Annotated[
 """A channel in a file, where its standard deviations are in its own unit instead of SI."""
 
 
-def _input_in_si(recorded_input: records.RecordedInput) -> records.RecordedInput:
-    """Check an input of a file, and return it with the deviation of its offset in SI.
+def _checked_input(recorded_input: records.RecordedInput) -> records.RecordedInput:
+    """Check an input of a file; return it with the deviation of its offset in SI.
 
-    A motion is smooth between its samples, unless it is a reference that a controller follows.
+    `hold` of a motion is set to smooth, unless it is a reference that a controller follows.
 
     Raises
     ------
     ValueError
-        If its column is reserved, or the file states another course than smooth for a motion.
+        If the unit does not fit the quantity or is degF, if the column is reserved, or if `hold` is
+        given for a motion other than a reference and is not smooth.
     """
     deviation = amount_in_si(recorded_input.offset_deviation, _unit_in_si(recorded_input))
     column = recorded_input.table_column
+    # a driven trial has no force but its inputs, one of which may be in the column `force`
     if column in INPUT_COLUMNS and column != "force":
         raise ValueError(
             f"the column {column!r} is reserved: give the input {recorded_input.name!r} another "
@@ -145,8 +147,8 @@ def _input_in_si(recorded_input: records.RecordedInput) -> records.RecordedInput
     if recorded_input.quantity.motion_chain and not recorded_input.reference:
         if hold not in (None, records.Hold.SMOOTH):
             raise ValueError(
-                f"the input {recorded_input.name!r} is a motion, which no drive makes in steps or "
-                "corners: leave `hold` out, set it to smooth, or set reference = true if a "
+                f"the input {recorded_input.name!r} is a motion, and no drive moves in steps or "
+                "with corners: leave `hold` out, set it to smooth, or set reference = true if a "
                 "controller follows the motion"
             )
         hold = records.Hold.SMOOTH
@@ -268,7 +270,7 @@ class CampaignSection(Section):
     channel: Annotated[tuple[ChannelInFile, ...], pydantic.Field(min_length=1), LIST]
     """What is measured."""
     input: Annotated[
-        tuple[Annotated[records.RecordedInput, pydantic.AfterValidator(_input_in_si)], ...], LIST
+        tuple[Annotated[records.RecordedInput, pydantic.AfterValidator(_checked_input)], ...], LIST
     ] = ()
     """Inputs of a driven trial, or of a static trial of an FMU."""
     trial: Annotated[tuple[TrialSection, ...], pydantic.Field(min_length=1), LIST]

@@ -97,26 +97,28 @@ class Prior:
             product = max(product, self.value(lowest))
         return min(max(self.standard_normal(product), lowest), highest)
 
-    def step_within_prior(self, u: float, step: float) -> float:
-        """Return the standard normal variable after a step of an iteration.
+    def step_along_tangent(self, u: float, step: float) -> float:
+        """Return the standard normal variable after a step of a fit.
 
-        A prediction that is proportional to a log-normal value x is not linear in u, but linear in
-        x. The step is therefore made in x along its tangent: with x = exp(m + s u), a step d in u
-        changes x by the factor 1 + s d, thus u by log(1 + s d) / s. The factor is kept above
-        `LEAST_SHRINKAGE`, so that x stays positive.
+        For a log-normal value the step is made along the tangent of x(u) = exp(m + s u), where m
+        and s are mean and standard deviation of log x. The reason is that predictions are often
+        proportional to x, and so linear in x but not in u. Along the tangent a step d in u changes
+        x by the factor 1 + s d, and thus u by log(1 + s d) / s. The factor is at least
+        `LEAST_SHRINKAGE`, so that x stays positive. Other values are linear in u or are taken as
+        such: the result is u + d.
 
         Parameters
         ----------
         u : float
-            Standard normal variable before the step.
+            The standard normal variable before the step.
         step : float
-            Step in u that the linear equations give.
+            The step d in u that the linear equations of the fit give.
         """
         if self.shape != "log_normal":
             return u + step
-        _, deviation = self._mean_and_deviation()
-        growth = max(1.0 + deviation * step, LEAST_SHRINKAGE)
-        return u + log(growth) / deviation
+        _, deviation_of_log = self._mean_and_deviation()
+        factor = max(1.0 + deviation_of_log * step, LEAST_SHRINKAGE)
+        return u + log(factor) / deviation_of_log
 
 
 @dataclass(frozen=True)

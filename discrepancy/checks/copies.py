@@ -9,11 +9,16 @@ import numpy as np
 from discrepancy.campaign.records import BoolArray, Campaign, FloatArray, Trial
 from discrepancy.checks.fault import DataFault, FaultKind, samples_text
 from discrepancy.checks.held import estimate_roughness
+from reporting.words import counted
 
 COPIED_SHARE = 0.01
 """A channel is a copy if another one leaves less than this fraction of its noise unexplained."""
-LEAST_COPIED = 32
-"""Fewest samples in which copies are searched."""
+LEAST_SAMPLES = 32
+"""Fewest samples that two channels must have in common for a comparison."""
+LEAST_DIFFERENT_READINGS = 16
+"""Fewest different readings of a channel with noise for a comparison."""
+LEAST_CHANGES = 64
+"""Fewest changes from one sample to the next in a channel without noise for a comparison."""
 _MOST_SHIFTED_SAMPLES = 2**14
 """Samples in which the shift between two channels is searched."""
 
@@ -26,11 +31,11 @@ class _Copy(NamedTuple):
     relation: str
 
 
-def copy_faults(campaign: Campaign) -> Iterator[DataFault]:
+def find_copied_channels(campaign: Campaign) -> Iterator[DataFault]:
     """Yield one fault for each pair of channels in which one channel is a copy of the other.
 
-    Only dynamic trials are searched. The fault names the first trial in which the copy shows, and
-    says in how many others it does.
+    Only dynamic trials are searched. The sentence of the fault describes the copy in the first
+    trial that shows it, and says how many more trials show it.
     """
     trials_of_pairs: dict[tuple[str, str], list[tuple[Trial, str]]] = {}
     for trial in campaign.trials:
@@ -42,10 +47,10 @@ def copy_faults(campaign: Campaign) -> Iterator[DataFault]:
         trial, relation = trials[0]
         further_trials = ""
         if len(trials) > 1:
-            further_trials = f", and so in {len(trials) - 1} more of its trials"
+            further_trials = f", and in {counted(len(trials) - 1, 'more trial')}"
         place = samples_text(campaign.channels[copy], trial)
         sentence = (
-            f"The channel {copy!r} is the channel {original!r} {relation} in "
+            f"The channel {copy!r} is a copy of the channel {original!r} {relation} in "
             f"{place}{further_trials}: two sensors never share their noise, so correct `column` "
             "or the table, or leave one of them out."
         )
@@ -57,10 +62,11 @@ def _copied_pairs(trial: Trial) -> Iterator[_Copy]:
 
     Different sensors have independent noise, copies have the same. Sixth differences separate the
     noise from the motion. The shift in time between two channels is the lag of the largest
-    cross-correlation of their noise, which must be at least 0.5 in magnitude. Channels without
-    noise are copies only if they are equal digit for digit and move.
+    cross-correlation of their noise, which must be at least 0.5 in magnitude. If one of two
+    channels has no noise, they are copies only if all their readings are equal and change at least
+    `LEAST_CHANGES` times.
     """
-    if len(trial.time) < LEAST_COPIED:
+    if len(trial.time) < LEAST_SAMPLES:
         return
     noise = _noise_by_differences(trial.values[:_MOST_SHIFTED_SAMPLES])  # (samples, channels)
     power = np.sum(noise**2, axis=0)
@@ -70,9 +76,9 @@ def _copied_pairs(trial: Trial) -> Iterator[_Copy]:
     spectra = np.fft.rfft(noise, 2 * len(noise), axis=0)  # padded, so that it does not wrap around
     change_counts = np.count_nonzero(np.diff(trial.values, axis=0), axis=0)
     for i, j in combinations(range(len(trial.channels)), 2):
-        relation = ""
+        relation = None
         if not (has_noise[i] and has_noise[j]):
-            moves = change_counts[i] >= 2 * LEAST_COPIED
+            moves = change_counts[i] >= LEAST_CHANGES
             if moves and np.array_equal(trial.values[:, i], trial.values[:, j]):
                 relation = "digit for digit"
         else:
@@ -80,7 +86,8 @@ def _copied_pairs(trial: Trial) -> Iterator[_Copy]:
             correlation = np.fft.irfft(spectra[:, j] * np.conj(spectra[:, i]))
             peak = int(np.argmax(np.abs(correlation)))
             if abs(correlation[peak]) >= 0.5 * np.sqrt(power[i] * power[j]):
-                # the second half of the inverse transform holds the negative lags
+                # by how many samples channel j lags channel i; the second half of the inverse
+                # transform holds the negative lags
                 shift = peak if peak < len(noise) else peak - len(correlation)
                 relation = _describe_copy(
                     trial.values[:, i],
@@ -89,7 +96,7 @@ def _copied_pairs(trial: Trial) -> Iterator[_Copy]:
                     trial.used[:, j],
                     shift,
                 )
-        if relation:
+        if relation is not None:
             yield _Copy(trial.channels[i], trial.channels[j], relation)
 
 
@@ -111,7 +118,7 @@ def _describe_copy(
     original_used: BoolArray,
     copy_used: BoolArray,
     shift: int,
-) -> str:
+) -> str | None:
     """Describe how one record is a copy of another: equal or scaled, and shifted in time.
 
     A scaled copy leaves less than `COPIED_SHARE` of its noise unexplained (standard deviations).
@@ -123,13 +130,14 @@ def _describe_copy(
     original_used, copy_used : (N,) ndarrays of bool
         False for samples that are left out.
     shift : int
-        The delay of the copy behind the original, in samples.
+        By how many samples the copy lags the original; negative if it leads.
 
     Returns
     -------
-    str
-        Phrase for a message, such as "times 1.5, 3 samples later,"; empty if it is not a copy, or
-        if too few samples or different readings overlap.
+    str or None
+        A phrase for a message, such as "times 1.5, 3 samples later,". None if it is not a copy, if
+        the records have too few samples or different readings in common, or if the copy has no
+        noise there.
     """
     # the overlap of the two records after the shift
     count = len(original) - abs(shift)
@@ -140,13 +148,13 @@ def _describe_copy(
     both_used = original_used[in_original] & copy_used[in_copy]
     x = original[in_original][both_used]
     y = copy[in_copy][both_used]
-    if len(y) < LEAST_COPIED or len(np.unique(x)) < LEAST_COPIED // 2:
-        return ""
+    if len(y) < LEAST_SAMPLES or len(np.unique(x)) < LEAST_DIFFERENT_READINGS:
+        return None
     # The robust estimate is zero if most readings repeat. Sixth differences of white noise have 924
     # times its variance, see `estimate_roughness`.
     noise = estimate_roughness(y) or float(np.std(np.diff(y, 6)) / np.sqrt(924.0))
     if noise == 0.0:
-        return ""
+        return None
     delay = ""
     if shift:
         delay = f", {abs(shift)} samples {'later' if shift > 0 else 'earlier'},"
@@ -156,4 +164,6 @@ def _describe_copy(
     centred_original = x - x.mean()
     scale = float(centred_original @ (y - y.mean()) / (centred_original @ centred_original))
     unexplained_deviation = float(np.std(y - scale * x))
-    return f"times {scale:.6g}{delay}" if unexplained_deviation < COPIED_SHARE * noise else ""
+    if unexplained_deviation >= COPIED_SHARE * noise:
+        return None
+    return f"times {scale:.6g}{delay}"

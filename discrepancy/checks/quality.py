@@ -21,7 +21,7 @@ from discrepancy.campaign.records import (
     Trial,
 )
 from discrepancy.campaign.sampling import quantum_of
-from discrepancy.checks.copies import copy_faults
+from discrepancy.checks.copies import find_copied_channels
 from discrepancy.checks.fault import DataFault, FaultKind, mark_accepted
 from discrepancy.checks.held import (
     estimate_roughness,
@@ -61,7 +61,7 @@ def check_data(campaign: Campaign) -> tuple[DataFault, ...]:
             faults += _clipped_faults(trial, name, trial.values[:, column], trial.used[:, column])
         if trial.is_dynamic:
             faults += stuck_sensor_faults(campaign, trial)
-    faults += copy_faults(campaign)
+    faults += find_copied_channels(campaign)
     faults += noise_record_faults(campaign)
     faults += _outlier_faults(campaign)
     return mark_accepted(faults, campaign)

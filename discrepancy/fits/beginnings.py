@@ -29,10 +29,11 @@ def refit_from_first_readings(
     iterations: int = MOST_FIT_STEPS,
     local_only: bool = False,
 ) -> CandidateFit:
-    """Repeat a fit from initial states that are fitted to the first readings.
+    """Return the better of a fit and a second fit, which begins at other initial states.
 
-    The better of both fits is returned. The second one also begins at the prior means of the shared
-    unknowns, unless these are fixed. The fit is not repeated if it explains the readings already,
+    The second fit begins at initial states that were fitted to the first readings of each trial and
+    then to longer and longer parts of it, and at the prior means of the shared unknowns, unless
+    these are fixed. It is not made if χ² per sample of the given fit is below `LARGEST_CHI_SQUARE`,
     or if no trial in motion has an unknown initial state.
 
     Parameters
@@ -43,8 +44,8 @@ def refit_from_first_readings(
         Whether only the trials' own unknowns are fitted, while shared unknowns and effects are
         fixed.
     """
-    is_fitted = fit.chi_square < LARGEST_CHI_SQUARE * float(problem.sample_counts.sum())
-    if is_fitted or not has_unknown_initial_state(problem):
+    explains_readings = fit.chi_square < LARGEST_CHI_SQUARE * float(problem.sample_counts.sum())
+    if explains_readings or not has_unknown_initial_state(problem):
         return fit
     candidate = fit.candidate
     start = Point(
@@ -53,10 +54,10 @@ def refit_from_first_readings(
         effect=fit.point.effect,
     )
     start = with_initial_states_of_first_readings(problem, start)
-    new_fit = try_fit(problem, candidate, start, iterations=iterations, local_only=local_only)
-    if new_fit is None or new_fit.objective >= fit.objective:
+    second_fit = try_fit(problem, candidate, start, iterations=iterations, local_only=local_only)
+    if second_fit is None or second_fit.objective >= fit.objective:
         return fit
-    return new_fit
+    return second_fit
 
 
 def has_unknown_initial_state(problem: Problem) -> bool:

@@ -235,7 +235,7 @@ class Candidate:
             self.parameters, scaled_values.tolist(), step.tolist(), strict=True
         ):
             if parameter.magnitude:
-                next_values.append(parameter.prior.step_within_prior(scaled_value, change))
+                next_values.append(parameter.prior.step_along_tangent(scaled_value, change))
             else:
                 next_values.append(scaled_value + change)
         return np.array(next_values)

@@ -281,30 +281,34 @@ class FmuSimulator(FmuAtRest):
         return SteppedOutputs(outputs, fixed_step or longest_step / parts)
 
     def _settled_with_laws(self, run: FmuRun, laws: PortLaws, trial: str) -> "SettledRun":
-        """Return a run that begins in equilibrium with the laws under its first loads.
+        """Return the run with such loads at its start that FMU and laws are then in equilibrium.
 
-        If no load acts, or no port of a law is displaced at the start, the run is returned as it
-        is, and the laws have no memory of earlier displacements.
+        The J laws are internal forces at ports, such as friction. The run starts at rest under the
+        loads `initial_offsets`, from which the forces of the laws are subtracted. The result also
+        has what the laws remember of the displacements up to there.
+
+        If the run has no loads in its steps (`offsets`), or if no port of a law is displaced at the
+        start, the run is returned as it is, and the memory is None.
         """
-        outputs = self._outputs_at_begin(run)
+        outputs_without_laws = self._outputs_at_begin(run)
         columns = [self.displacement_columns[self.ports.index(name)] for name in laws.ports]
-        if not run.offsets or not np.any(outputs[:, columns]):
+        if not run.offsets or not np.any(outputs_without_laws[:, columns]):
             return SettledRun(run, None)
 
-        def run_under(forces: FloatArray) -> FmuRun:
-            """Return the run whose first inputs are the loads minus forces of the laws (1, J)."""
+        def run_under(law_forces: FloatArray) -> FmuRun:
+            """Return the run that starts under its loads minus the forces (1, J) of the laws."""
             loads = {name: np.full(1, value) for name, value in run.initial_offsets.items()}
-            first_loads = self.subtract_law_forces(loads, laws, forces)
+            remaining_loads = self.subtract_law_forces(loads, laws, law_forces)
             return run._replace(
-                initial_offsets={name: float(values[0]) for name, values in first_loads.items()}
+                initial_offsets={name: float(load[0]) for name, load in remaining_loads.items()}
             )
 
-        def outputs_under(forces: FloatArray) -> FloatArray:
-            """Return the outputs at the start under given forces of the laws."""
-            return self._outputs_at_begin(run_under(forces))
+        def outputs_under(law_forces: FloatArray) -> FloatArray:
+            """Return the outputs (1, C) at the start under forces (1, J) of the laws."""
+            return self._outputs_at_begin(run_under(law_forces))
 
         _, solution = self.find_equilibrium_with_laws(
-            laws, outputs_under, outputs, run.operating_point, trial
+            laws, outputs_under, outputs_without_laws, run.operating_point, trial
         )
         return SettledRun(run_under(solution.forces), solution.memory)
 

@@ -71,7 +71,11 @@ class ScoreTest:
 
 
 def check_consistency(problem: Problem, fit: CandidateFit) -> Gate:
-    """Test whether the residuals of a fit follow loads, runs or the channel of one of its effects.
+    """Test whether residuals of a fit depend on load, on run, or on the channel of an effect.
+
+    A dependence on load is looked for in static trials and in flights, one on the run in static
+    trials. For each effect that acts on one channel alone, the readings of this channel in all
+    trials are tested. See `directions_by_test`.
 
     Parameters
     ----------
@@ -83,13 +87,14 @@ def check_consistency(problem: Problem, fit: CandidateFit) -> Gate:
     Gate
         The outcome. Its statistic is the least p-value of all tests, multiplied by their number
         (Bonferroni's correction). `passed` is None if nothing can be tested: no trial is static or
-        a flight and no effect acts on one channel alone, or there are too few readings.
+        a flight and no effect acts on one channel alone, or there are too few readings, or the
+        nuisances and the effects can compensate all directions.
     """
     tests = score_tests(problem, fit, directions_by_test(problem, fit))
     if not tests:
         reason = (
-            "No trial has a stated load, or there are too few readings, so whether the residuals "
-            "follow the load cannot be tested."
+            "No trial is static or a flight, or there are too few readings, so whether the "
+            "residuals follow the load cannot be tested."
         )
         return Gate("consistency", None, np.nan, CONSISTENCY_LEVEL, reason)
     worst_test = min(tests, key=lambda test: test.p_value)

@@ -148,17 +148,17 @@ class ChiSquare:
 def chi_square_of(residuals: ResidualSet) -> ChiSquare:
     """Return χ² per sample of trials that are all fitted, or all held out.
 
-    Residuals are compared with the noise records. Channels without a record do not count; if no
-    channel has one, all values are nan. The expected sum of squares of a right model is that of the
-    noise, minus what the fit absorbs in fitted trials, plus what the uncertainty of the fit adds in
-    held-out trials.
+    Residuals are compared with the noise records, and channels without a record do not count. All
+    values are nan if no channel has one, or if the residuals have no degrees of freedom left. The
+    expected mean square of a right model is that of the noise, 1, minus what the fit absorbs in
+    fitted trials, plus what the uncertainty of the fit adds in held-out trials.
     """
-    undetermined = ChiSquare(nan, nan, nan)
+    undetermined = ChiSquare(per_sample=nan, expected=nan, deviation=nan)
     channels = residuals.recorded_channels
     if not channels:
         return undetermined
-    _, freedom = mean_square_ratio(residuals, channels)
-    if freedom <= 0.0:
+    degrees_of_freedom = mean_square_ratio(residuals, channels).degrees_of_freedom
+    if degrees_of_freedom <= 0.0:
         return undetermined
     squares = []
     variances = []
@@ -166,12 +166,18 @@ def chi_square_of(residuals: ResidualSet) -> ChiSquare:
         for fitted_trial, column, is_used in channel_fits(residuals.trials, name):
             squares.append(fitted_trial.standardised[is_used, column] ** 2)
             variances.append(fitted_trial.expected_variance[is_used, column])
-    expected_chi_square = float(np.concatenate(variances).mean())
-    # Channels may share their record or not. The worst case is assumed: all share the poorest one.
-    noise_freedom = min(residuals.degrees_of_freedom(name) for name in channels)
-    # relative variance of a mean square of n degrees of freedom: 2 / n, for residuals and record
-    deviation = expected_chi_square * sqrt(2.0 / freedom + 2.0 / noise_freedom)
-    return ChiSquare(float(np.concatenate(squares).mean()), expected_chi_square, deviation)
+    expected = float(np.concatenate(variances).mean())
+    # Channels may share a noise record or not. The worst case is assumed: all share the record with
+    # the fewest degrees of freedom.
+    freedom_of_record = min(residuals.degrees_of_freedom(name) for name in channels)
+    # A mean square of n degrees of freedom has the relative variance 2 / n. Those of the residuals
+    # and of the record add up.
+    relative_variance = 2.0 / degrees_of_freedom + 2.0 / freedom_of_record
+    return ChiSquare(
+        per_sample=float(np.concatenate(squares).mean()),
+        expected=expected,
+        deviation=expected * sqrt(relative_variance),
+    )
 
 
 def samples_per_independent_sample(series: FloatArray) -> float:

@@ -197,7 +197,8 @@ class _PredictedTrial(NamedTuple):
     mean : (N, C) array
         The mean of the prediction.
     factor : (K, N, C) array
-        A factor S of the prediction's covariance S^T S by K unknowns, without the noise.
+        A factor S of the prediction's covariance S^T S, which K unknowns cause. The covariance of
+        the noise comes on top.
     """
 
     mean: FloatArray
@@ -213,11 +214,11 @@ class _PredictedTrial(NamedTuple):
 def _predicted_trial(
     trial_problem: Problem, fit: CandidateFit, recorded_over_actual_noise: FloatArray
 ) -> _PredictedTrial:
-    """Return the Gaussian prediction of a new trial by a hypothesis, over the noise deviation.
+    """Return what a hypothesis predicts for a new trial, in units of the actual noise deviation.
 
-    Its covariance has three sources:
+    The prediction is Gaussian. Its covariance has three sources:
 
-    - the prior of the trial's own unknowns, such as zeros of channels;
+    - the prior of the trial's local unknowns, such as zeros of channels;
     - the posterior of the unknowns that the trial shares with the fitted trials;
     - the prior of gain errors of channels that no fitted trial has.
 
@@ -230,22 +231,23 @@ def _predicted_trial(
     """
     data = trial_problem.trials[0]  # the new trial, the only one of the problem
     local_count = data.unknowns.unknown_count
-    # the trial's own unknowns are at their prior means: no reading has determined them
+    # the local unknowns are at their prior means: no reading has determined them
     point = Point(fit.point.shared, (np.zeros(local_count),), fit.point.effect)
     derivatives = trial_problem.linearise(0, point, fit.candidate)
     derivatives_by_unknowns, shared_indices = trial_problem.prediction_derivatives(
         0, point, derivatives, fit.candidate
     )
-    # `standardise` divides by the recorded noise, and this scale turns it into the actual noise
+    # `standardise` divides readings by the recorded noise deviation; times this factor they are
+    # divided by the actual one
     reading_scale = recorded_over_actual_noise[data.channel_indices]  # (C,)
-    # (unknowns, N, C), the trial's own unknowns first
+    # (unknowns, N, C), the local unknowns first
     jacobian = data.standardise(derivatives_by_unknowns) * reading_scale
     local_jacobian, shared_jacobian = np.split(jacobian, [local_count])
     prediction = trial_problem.prediction(0, point, derivatives.response)
     mean = data.standardise(prediction) * reading_scale
-    # factors S of the covariance S^T S: with C = R R^T the posterior covariance of the shared
-    # unknowns and J their derivatives, J^T C J = (R^T J)^T (R^T J); own unknowns are independent
-    # with the variance 1 / precision
+    # Factors S of the covariance S^T S. Shared unknowns have the posterior covariance P = R R^T.
+    # With the derivatives J of the readings by them, J^T P J = (R^T J)^T (R^T J). Local unknowns
+    # are independent with the variance 1 / precision.
     covariance = fit.covariance[np.ix_(shared_indices, shared_indices)]
     covariance_root = np.linalg.cholesky(covariance + LEAST_VARIANCE * np.eye(len(shared_indices)))
     prior_precision = np.maximum(data.unknowns.precision, FREE_PRECISION)

@@ -186,17 +186,20 @@ def windows_of_residuals(
 def add_window_sizes(
     windows: Sequence[GapWindow], residuals_before: ResidualSet, residuals_after: ResidualSet
 ) -> tuple[GapWindow, ...]:
-    """Return windows with the sizes and channels that the residuals show in them.
+    """Return windows with their sizes, and with the channels that show a gap in them.
 
-    A window without a reading that counts is left out, as nothing shows a gap in it.
+    The size of a window is the largest rms residual of a channel in it, in units of the noise
+    deviation. Channels with at least `LEAST_RMS_SHARE` of it show the gap. A window without a
+    usable reading is left out, as nothing shows a gap in it.
 
     Parameters
     ----------
     windows : sequence of GapWindow
-        The windows of the unchanged model, and those of the hypothesis of the verdict.
+        The windows in which a gap remains with a hypothesis (`with_effect`), and those of the
+        unchanged model.
     residuals_before, residuals_after : ResidualSet
-        The residuals without and with the hypothesis. Both are divided by the noise of
-        `residuals_before`, so that sizes with and without the hypothesis can be compared.
+        The residuals of the unchanged model, and those with the hypothesis. Both are divided by the
+        noise of `residuals_before`, so that sizes with and without the hypothesis can be compared.
     """
     noise = {
         fitted_trial.trial.name: fitted_trial.noise_deviation
@@ -222,7 +225,7 @@ def add_window_sizes(
 
 
 def _used_in_window(window: GapWindow, fitted_trial: FittedTrial) -> BoolArray:
-    """Return which readings (N, C) of a trial count and lie in a window."""
+    """Return which readings (N, C) of a trial are usable and lie in a window."""
     begin = window.first if window.begin is None else window.begin.value
     end = window.last if window.end is None else window.end.value
     time = fitted_trial.trial.time

@@ -263,10 +263,10 @@ def planform_figure(
 
 
 def _planform_position(design: WingDesign, station: float, fraction: float) -> tuple[float, float]:
-    """Return the coordinates of a position in the planform [m]: along the span, along the chord.
+    """Return the coordinates of a position in the planform.
 
-    The chordwise coordinate is measured from the leading edge at the root. At the chord fraction
-    `straight_chord_line` the wing is straight.
+    The planform is drawn so that the line at the chord fraction `straight_chord_line` is straight
+    and runs along the span. A station beyond the tip has the chord of the tip.
 
     Parameters
     ----------
@@ -274,11 +274,19 @@ def _planform_position(design: WingDesign, station: float, fraction: float) -> t
         Distance from the root [m].
     fraction : float
         Chord fraction from the leading edge.
+
+    Returns
+    -------
+    along_span : float
+        The station itself [m].
+    along_chord : float
+        Distance aft of the leading edge at the root [m].
     """
     form = design.planform
+    straight_line_fraction = form.straight_chord_line
     chord = form.chord(min(station / form.semi_span, 1.0))
-    behind_straight_line = (fraction - form.straight_chord_line) * chord
-    return station, form.straight_chord_line * form.root_chord + behind_straight_line
+    behind_straight_line = (fraction - straight_line_fraction) * chord
+    return station, straight_line_fraction * form.root_chord + behind_straight_line
 
 
 def _draw_planform(axes: Axes, design: WingDesign) -> None:

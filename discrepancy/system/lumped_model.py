@@ -249,8 +249,8 @@ class LumpedModel(DescribedModel, SystemModel):
         Raises
         ------
         ModelError
-            If the model has no such input, or one of another quantity, or if a motion or state that
-            is prescribed goes in steps or corners.
+            If the model has no such input, or one of another quantity, or if `hold` of a motion or
+            state that the model prescribes is given and is not smooth.
         """
         section = self._inputs.get(record.name)
         if section is None:
@@ -268,7 +268,7 @@ class LumpedModel(DescribedModel, SystemModel):
             prescribed = "state" if section.prescribes_state else "motion"
             raise ModelError(
                 f"The input {record.name!r} of the trial {trial.name!r} is a {prescribed} "
-                f"that {self.name!r} prescribes, which no drive makes in steps or corners: leave "
+                f"that {self.name!r} prescribes, and no drive goes in steps or with corners: leave "
                 "`reference` and `hold` out."
             )
         return section

@@ -140,22 +140,23 @@ class StaticReduction:
     def _extend_residuals(self, images: FloatArray) -> None:
         """Extend the basis of residuals by the images of new basis vectors.
 
-        `images` (T, n, new) are the T stiffness terms times the new vectors.
+        The `images` (T, n, k) are the T stiffness terms times the k new vectors. The basis of
+        residuals grows from r to R vectors.
         """
-        previous_size = self.residuals.vectors.shape[1]
-        whitened = self.terms.factors.whitened(np.concatenate(images, axis=1))
-        coordinates = self.residuals.extend(whitened)
-        # corrections of the outputs by the dual solutions
-        new_vectors = self.residuals.vectors[:, previous_size:]
-        new_correction = self.duals.functions @ new_vectors
+        previous_size = self.residuals.vectors.shape[1]  # r
+        whitened_images = self.terms.factors.whitened(np.concatenate(images, axis=1))  # (n, T k)
+        coordinates = self.residuals.extend(whitened_images)  # (R, T k)
+        # corrections of the outputs by the dual solutions: anchors, functions, outputs, residuals
+        new_vectors = self.residuals.vectors[:, previous_size:]  # (n, R - r)
+        new_correction = self.duals.functions @ new_vectors  # (A, M, O, R - r)
         self.dual_correction = np.concatenate((self.dual_correction, new_correction), axis=3)
         # loads and previous images have no component along the new vectors
-        size = len(coordinates)
+        size = len(coordinates)  # R
         new_rows = (0, size - previous_size)
         unchanged = (0, 0)
-        self.residual_load = np.pad(self.residual_load, (new_rows, unchanged))
+        self.residual_load = np.pad(self.residual_load, (new_rows, unchanged))  # (R, L)
         previous_stiffness = np.pad(self.residual_stiffness, (new_rows, unchanged, unchanged))
-        new_stiffness = coordinates.reshape(size, len(images), -1)
+        new_stiffness = coordinates.reshape(size, len(images), -1)  # (R, T, k)
         self.residual_stiffness = np.concatenate((previous_stiffness, new_stiffness), axis=2)
 
     def _galerkin(self, theta: FloatArray) -> FloatArray:

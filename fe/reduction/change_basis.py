@@ -127,7 +127,21 @@ class _Columns:
     yielding : AffineStructure
         The structure whose supports yield.
     reduction : Reduction
-        The reduction of the same structure with its supports held, with n unknowns.
+        The reduction of the same structure with its supports held, with n unknowns: the first n of
+        the n'.
+
+    Attributes
+    ----------
+    free_count : int
+        The number n of unknowns that are free if the supports are held.
+    free : slice
+        These unknowns among all n'.
+    column_blocks : list of (n', k) array
+        The columns, in the order in which they were added.
+    block_owners : list of (k,) array of int
+        The number of the change that each column belongs to, from 1; 0 for the structure itself.
+    base : OrthonormalBasis
+        A basis, in whitened coordinates, of the columns of the reduction.
     """
 
     def __init__(self, yielding: AffineStructure, reduction: Reduction) -> None:
@@ -136,27 +150,32 @@ class _Columns:
         self.held_terms = reduction.terms
         self.factors = reduction.terms.factors
         self.terms = ReductionTerms(yielding)
-        self.free = reduction.terms.structure.unknowns
+        self.free_count = reduction.terms.structure.unknowns
+        self.free = slice(self.free_count)
         masses = (1.0, *yielding.masses.values())
         self.mass = sum(
             (value * term for value, term in zip(masses, yielding.mass_terms, strict=True)),
             sparse.csr_array(yielding.mass_terms[0].shape),
         ).tocsr()
         base = np.concatenate((reduction.modal_basis, reduction.static_basis), axis=1)
-        self.blocks = [np.pad(base, ((0, yielding.unknowns - self.free), (0, 0)))]
-        self.owners = [np.zeros(base.shape[1], dtype=np.int64)]
-        self.base = OrthonormalBasis(self.free, drop=SAME_DIRECTION)
+        self.column_blocks = [self._padded(base)]
+        self.block_owners = [np.zeros(base.shape[1], dtype=np.int64)]
+        self.base = OrthonormalBasis(self.free_count, drop=SAME_DIRECTION)
         self.base.extend(self._whitened(base))
         self.mass_places = mass_places(yielding)
         self.loss_places = loss_places(yielding)
         self.load_changes = load_changes(yielding)
         # the responses to forces at another point, or in another direction
-        forces = [change.vector[: self.free] for change in self.load_changes]
+        forces = [change.vector[self.free] for change in self.load_changes]
         forces += [
-            change.curvature[: self.free] for change in self.load_changes if change.curvature.any()
+            change.curvature[self.free] for change in self.load_changes if change.curvature.any()
         ]
-        responses = self.factors.whitened(np.array(forces).reshape(-1, self.free).T)
-        self._add_remainders(0, responses / np.linalg.norm(responses, axis=0))
+        responses = self.factors.whitened(np.array(forces).reshape(-1, self.free_count).T)
+        self._add_orthogonal_part(0, responses / np.linalg.norm(responses, axis=0))
+
+    def _padded(self, columns: FloatArray) -> FloatArray:
+        """Return columns (n, k) on all n' unknowns, with zeros where supports hold."""
+        return np.pad(columns, ((0, self.structure.unknowns - self.free_count), (0, 0)))
 
     def _whitened(self, displacements: FloatArray) -> FloatArray:
         """Return displacements (n, k) in whitened coordinates, in which energy is length."""
@@ -174,14 +193,14 @@ class _Columns:
         changes_of_response = self._unit_responses(motion, self._other_states()) - unit_response
         # the displacements of all unknowns when the support moves
         unit_displacement = np.zeros((self.structure.unknowns, 1))
-        unit_displacement[: self.free] = unit_response
+        unit_displacement[self.free] = unit_response
         if is_held:
             unit_displacement[motion.unknown] = 1.0
-            self.blocks.append(unit_displacement)
-            self.owners.append(np.array([number], dtype=np.int64))
+            self.column_blocks.append(unit_displacement)
+            self.block_owners.append(np.array([number], dtype=np.int64))
         snapshots = [] if is_held else [unit_response]
-        inertia_force = (self.mass @ unit_displacement)[: self.free]
-        free_mass = self.mass[: self.free, : self.free]
+        inertia_force = (self.mass @ unit_displacement)[self.free]
+        free_mass = self.mass[self.free, self.free]
         for _ in range(INERTIA_RESPONSES):
             snapshots.append(self.factors.riesz(inertia_force))
             inertia_force = free_mass @ snapshots[-1]
@@ -190,7 +209,7 @@ class _Columns:
         # a change of the unit response is relative to the unit response
         scale = np.linalg.norm(self._whitened(unit_response))
         block = np.concatenate((*directions, self._whitened(changes_of_response) / scale), axis=1)
-        self._add_remainders(number, block)
+        self._add_orthogonal_part(number, block)
 
     def refine(self, model: ChangeableModel, number: int) -> None:
         """Add the modes of the full model under one change, after a step of inverse iteration.
@@ -203,38 +222,49 @@ class _Columns:
                 modes = modes - modes[[self.structure.support_motions[number].unknown]] * (
                     case.direction
                 )
-            block = self._whitened(modes[: self.free])
-            self._add_remainders(1 + number, block / np.linalg.norm(block, axis=0))
+            block = self._whitened(modes[self.free])
+            self._add_orthogonal_part(1 + number, block / np.linalg.norm(block, axis=0))
 
-    def _add_remainders(
-        self, number: int, block: FloatArray, least: float = LEAST_REMAINDER
+    def _add_orthogonal_part(
+        self, change: int, block: FloatArray, least_norm: float = LEAST_REMAINDER
     ) -> None:
-        """Add to a change's columns what whitened vectors (n, k) contain beyond these columns.
+        """Add that part of a block to the columns which is orthogonal to the columns of a change.
 
-        Directions with a norm below `least` are left out. `number` is that of the change, from 1.
+        It is also orthogonal to the columns of the reduction. The new columns belong to the change.
+
+        Parameters
+        ----------
+        change : int
+            The number of the change, from 1; 0 for the structure itself.
+        block : (n, k) array
+            Whitened vectors.
+        least_norm : float
+            Singular value of the orthogonal part up to which its directions are left out.
         """
-        own_basis = OrthonormalBasis(self.free, drop=SAME_DIRECTION)
-        own_basis.vectors = self.base.vectors
-        for columns_of_change, owner in zip(self.blocks, self.owners, strict=True):
-            free_part = columns_of_change[: self.free]
-            is_lift = columns_of_change[self.free :].any()
-            if owner[:1].tolist() == [number] and not is_lift and columns_of_change.shape[1]:
-                own_basis.extend(self._whitened(free_part))
+        basis_of_change = OrthonormalBasis(self.free_count, drop=SAME_DIRECTION)
+        basis_of_change.vectors = self.base.vectors
+        for columns, owners in zip(self.column_blocks, self.block_owners, strict=True):
+            is_of_change = owners.size > 0 and owners[0] == change  # all owners of a block agree
+            # unit motions of supports are left out: in whitened coordinates all supports are held
+            moves_support = columns[self.free_count :].any()
+            if is_of_change and not moves_support:
+                basis_of_change.extend(self._whitened(columns[self.free]))
+        # twice: the second pass removes what rounding left
         for _ in range(2):
-            block = block - own_basis.vectors @ (own_basis.vectors.T @ block)
+            block = block - basis_of_change.vectors @ (basis_of_change.vectors.T @ block)
         # singular directions by the method of snapshots
         eigenvalues, eigenvectors = np.linalg.eigh(block.T @ block)
-        is_kept = eigenvalues > least**2
+        is_kept = eigenvalues > least_norm**2
         directions = block @ (eigenvectors[:, is_kept] / np.sqrt(eigenvalues[is_kept]))
         columns = self.factors.unwhitened(directions)
-        self.blocks.append(np.pad(columns, ((0, self.structure.unknowns - self.free), (0, 0))))
-        self.owners.append(np.full(columns.shape[1], number, dtype=np.int64))
+        self.column_blocks.append(self._padded(columns))
+        self.block_owners.append(np.full(columns.shape[1], change, dtype=np.int64))
 
     def _shapes(self, structure: ChangedStructure) -> FloatArray:
         """Return the mode shapes (n', M) of a structure on all unknowns."""
         shapes = structure.basis @ structure.mode_shapes
         count = len(shapes)
-        return np.asarray(np.concatenate(self.blocks, axis=1)[:, :count] @ shapes)
+        return np.asarray(np.concatenate(self.column_blocks, axis=1)[:, :count] @ shapes)
 
     def _other_states(self) -> FloatArray:
         """Return the coefficients (B, T) of the stiffness terms at corners of the ranges."""
@@ -249,15 +279,12 @@ class _Columns:
         T stiffness terms in each state.
         """
         if motion.spring > 0.0:
-            unit_force = np.zeros((self.free, 1))
+            unit_force = np.zeros((self.free_count, 1))
             unit_force[motion.unknown] = 1.0
             loads = np.tile(unit_force, len(thetas))
         else:
             coupling = np.column_stack(
-                [
-                    term[: self.free, [motion.unknown]].toarray()
-                    for term in self.terms.stiffness_terms
-                ]
+                [term[self.free, [motion.unknown]].toarray() for term in self.terms.stiffness_terms]
             )
             loads = -coupling @ thetas.T
         whitened = self.factors.whitened(loads)
@@ -273,7 +300,9 @@ class _Columns:
 
     def model(self) -> ChangeableModel:
         """Return the model on all columns; its errors are not measured yet."""
-        whole = WholeColumns(np.concatenate(self.blocks, axis=1), np.concatenate(self.owners))
+        whole = WholeColumns(
+            np.concatenate(self.column_blocks, axis=1), np.concatenate(self.block_owners)
+        )
         changes = PossibleChanges(self.mass_places, self.loss_places, self.load_changes)
         return model_on_columns(
             self.structure,
@@ -291,15 +320,15 @@ class _Columns:
         """
         names = [candidate.name for candidate in self.mass_places]
         number = self._first_mass + names.index(place.name)
-        self._add_remainders(number, self._unit_responses_to(place.rows))
+        self._add_orthogonal_part(number, self._unit_responses_to(place.rows))
         if place.reach > 0.0:
             rows = [place.rows_beside(*ends) for ends in place.reach * np.array(BESIDE)]
             responses = self._unit_responses_to(sparse.vstack(rows).tocsr())
-            self._add_remainders(number, responses, LEAST_REMAINDER_BESIDE)
+            self._add_orthogonal_part(number, responses, LEAST_REMAINDER_BESIDE)
 
     def _unit_responses_to(self, rows: sparse.csr_array) -> FloatArray:
         """Return the static responses (n, k) to forces along rows, whitened and of unit length."""
-        block = self.factors.whitened(rows[:, : self.free].toarray().T)
+        block = self.factors.whitened(rows[:, self.free].toarray().T)
         lengths = np.linalg.norm(block, axis=0)
         is_moved = lengths > SAME_DIRECTION * lengths.max()
         return np.asarray(block[:, is_moved] / lengths[is_moved])
@@ -313,7 +342,7 @@ class _Columns:
         forces = self._forces_of_snapshots
         snapshots = self.factors.riesz(forces)
         patch_stiffness = {
-            term: matrix[: self.free, : self.free] for term, matrix in patch.terms.items()
+            term: matrix[self.free, self.free] for term, matrix in patch.terms.items()
         }
         lost_forces = np.zeros_like(snapshots)
         for term, matrix in patch_stiffness.items():
@@ -324,7 +353,7 @@ class _Columns:
             for loss in LARGE_LOSSES
         ]
         block = np.concatenate((changes_by_small_loss, *changes_by_large_losses), axis=1)
-        self._add_remainders(number, self._whitened(block), LEAST_LOSS_REMAINDER)
+        self._add_orthogonal_part(number, self._whitened(block), LEAST_LOSS_REMAINDER)
 
     @cached_property
     def _forces_of_snapshots(self) -> FloatArray:
@@ -332,7 +361,7 @@ class _Columns:
         terms = self.held_terms
         modes = self.reduction.modal_basis
         stiffness = terms.structure.stiffness()
-        mass = self.mass[: self.free, : self.free]
+        mass = self.mass[self.free, self.free]
         _, shapes = eigh(
             modes.T @ (stiffness @ modes),
             modes.T @ (mass @ modes),
@@ -402,7 +431,7 @@ class _Columns:
         # the full model by Sherman and Morrison: the held structure, and its unit response
         direction = np.zeros((self.structure.unknowns, 1))
         response = self._unit_responses(motion, reference[np.newaxis])
-        direction[: self.free] = response
+        direction[self.free] = response
         if motion.spring == 0.0:
             direction[motion.unknown] = 1.0
             stiffness_times_direction = affine_product(
@@ -427,7 +456,7 @@ class _Columns:
     def _held_solution(self, loads: FloatArray) -> FloatArray:
         """Return the displacements (n', k) of the full model under loads, with supports held."""
         solution = np.zeros_like(loads)
-        solution[: self.free] = self.factors.solve(loads[: self.free])
+        solution[self.free] = self.factors.solve(loads[self.free])
         return solution
 
     def _case_with_mass(
@@ -453,21 +482,23 @@ class _Columns:
         """Return the model with a loss of stiffness, beside the full solution of this case."""
         patch = self.loss_places[number]
         patch_stiffness = {
-            term: matrix[: self.free, : self.free] for term, matrix in patch.terms.items()
+            term: matrix[self.free, self.free] for term, matrix in patch.terms.items()
         }
         primitive = RegionStiffnessLoss(patch.name, loss)
         vector = self._middle_vector(model)
         structure = ChangedStructure(model, vector, ModelPatch((primitive,)))
 
-        basis = np.concatenate(self.blocks, axis=1)[:, : len(structure.basis)] @ structure.basis
+        basis = (
+            np.concatenate(self.column_blocks, axis=1)[:, : len(structure.basis)] @ structure.basis
+        )
 
         def full_solution(loads: FloatArray) -> FloatArray:
             solution = basis @ structure.static(basis.T @ loads)
-            solution[: self.free] = self._solution_with_loss(
+            solution[self.free] = self._solution_with_loss(
                 patch_stiffness,
                 loss,
-                loads[: self.free],
-                start=solution[: self.free],
+                loads[self.free],
+                start=solution[self.free],
                 tolerance=SOLUTION_TOLERANCE,
             )
             return solution

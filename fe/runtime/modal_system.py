@@ -170,22 +170,27 @@ class ModalSystem:
 
     @cached_property
     def _free_modes(self) -> "_FreeModes | None":
-        """The free motion as a sum of damped oscillations, or None if this would be inaccurate.
+        """The free motion as a sum of damped oscillations and decays.
 
-        Close to critical damping the eigenvectors are nearly parallel.
+        It is None if the eigenvectors are nearly parallel, as they are close to critical damping:
+        the sum would then be inaccurate.
         """
-        speed_unit, rates, vectors = self._eigenvectors
-        if not np.linalg.cond(vectors) < LARGEST_CONDITION:
+        eigenvectors = self._eigenvectors
+        if not np.linalg.cond(eigenvectors.vectors) < LARGEST_CONDITION:
             return None
-        scale = np.concatenate((np.ones_like(speed_unit), speed_unit))
-        # The two rates of a conjugate pair add to twice the real part of one of them. Only the rate
-        # with a positive imaginary part is kept, and its amplitude is doubled.
+        # factors (2M,) from the units of the eigenvectors to those of coordinates and speeds
+        speed_unit = eigenvectors.speed_unit
+        state_units = np.concatenate((np.ones_like(speed_unit), speed_unit))
+        # The terms of a conjugate pair of rates add up to twice the real part of one of them. Of
+        # each pair only the rate with a positive imaginary part is kept, and its amplitude is
+        # doubled. Real rates are kept as they are.
+        rates = eigenvectors.rates
         is_upper_half = rates.imag >= 0.0
         multiplicity = np.where(rates.imag > 0.0, 2.0, 1.0)
-        amplitudes = np.linalg.inv(vectors) / scale * multiplicity[:, None]
+        amplitudes = np.linalg.inv(eigenvectors.vectors) / state_units * multiplicity[:, None]
         return _FreeModes(
             rates[is_upper_half],
-            scale[:, None] * vectors[:, is_upper_half],
+            state_units[:, None] * eigenvectors.vectors[:, is_upper_half],
             amplitudes[is_upper_half],
         )
 
@@ -254,7 +259,8 @@ class _Eigenvectors(NamedTuple):
     Attributes
     ----------
     speed_unit : (M,) array
-        Units of the speeds in the eigenvectors, chosen to balance the matrix [1/s].
+        The unit of each coordinate's speed in the eigenvectors, which balances the matrix: the
+        angular frequency of the coordinate, or 1 if that is zero [1/s].
     rates : (2M,) array
         Eigenvalues [1/s].
     vectors : (2M, 2M) array
@@ -267,16 +273,18 @@ class _Eigenvectors(NamedTuple):
 
 
 class _FreeModes(NamedTuple):
-    """The damped oscillations that make up free motion, one for each conjugate pair of rates.
+    """The terms that make up free motion: an oscillation for each conjugate pair of rates.
+
+    A real rate has a term of its own, which decays or is constant.
 
     Attributes
     ----------
     rates : (R,) array
         Eigenvalues [1/s].
     shapes : (2M, R) array
-        Coordinates and speeds of each oscillation.
+        Coordinates and speeds of each term.
     amplitudes : (R, 2M) array
-        Amplitude of each oscillation (row) per unit of each coordinate and speed at time zero.
+        Amplitude of each term (row) per unit of each coordinate and speed at time zero.
     """
 
     rates: ComplexArray

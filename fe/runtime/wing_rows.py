@@ -212,9 +212,16 @@ class WingRows:
         return arrays.root_chord + taper * y / arrays.semi_span
 
     def manoeuvre_loads(self, patch: ModelPatch = NO_PATCH) -> FloatArray:
-        """Return the loads (2, n) in a turn: per unit of the load factor, and of its square [N].
+        """Return the loads of a manoeuvre with load factor N: row 0 times N plus row 1 times N^2.
 
-        Washouts, reliefs by weight and point masses in the patch change the loads.
+        Lift and weight are proportional to N, and so are their changes by reliefs by weight and
+        point masses of the patch. A washout takes lift off in proportion to the lift itself and to
+        the bending that it causes, each proportional to N: this load is proportional to N^2.
+
+        Returns
+        -------
+        (2, n) array
+            The loads [N].
 
         Raises
         ------
@@ -222,8 +229,8 @@ class WingRows:
             If the exponent of a washout is negative, or a point mass lies off the wing.
         """
         arrays = self.arrays
-        linear_loads = arrays.load_lift.copy()
-        quadratic_loads = np.zeros(self.size)
+        linear_load = arrays.load_lift.copy()
+        quadratic_load = np.zeros(self.size)
         for primitive in patch:
             if isinstance(primitive, Washout):
                 if primitive.exponent < 0.0:
@@ -232,15 +239,15 @@ class WingRows:
                         f"{primitive.exponent:g}."
                     )
                 eta = np.clip(arrays.stations / arrays.semi_span, 0.0, 1.0)
-                quadratic_loads -= primitive.coefficient * (
+                quadratic_load -= primitive.coefficient * (
                     eta**primitive.exponent @ arrays.lift_rows
                 )
             elif isinstance(primitive, InertiaRelief):
-                linear_loads += primitive.fraction * arrays.weight
+                linear_load += primitive.fraction * arrays.weight
             elif isinstance(primitive, PointMass):
                 row = self._station_weights(primitive.station) @ self._upward_rows
-                linear_loads -= STANDARD_GRAVITY * primitive.mass * row
-        return np.stack((linear_loads, quadratic_loads))
+                linear_load -= STANDARD_GRAVITY * primitive.mass * row
+        return np.stack((linear_load, quadratic_load))
 
     @cached_property
     def planform_stations(self) -> PlanformStations:

@@ -1,6 +1,5 @@
 """Convert a deck of CalculiX to a structure from matrices, and check it against CalculiX."""
 
-import itertools
 import re
 from collections import Counter
 from collections.abc import Sequence
@@ -304,27 +303,42 @@ def _choose_outputs(
     matrices: StoredMatrices,
     names: Sequence[str],
 ) -> tuple[MotionRows, list[OutputSet]]:
-    """Return the sets whose mean displacement is an output, and how it follows from the rows.
+    """Return how the motions of nodes follow from the matrices, and the sets that become outputs.
 
-    Raises `MeshError` if a name is no set of nodes, or the displacement of its nodes is not known.
+    The output of a set is its mean displacement. If nodes of a set are tied, CalculiX runs again on
+    the deck `blocks`, to find how they move. Raises `MeshError` if a name does not name a set of
+    nodes or a node, or if the displacement of these nodes is not known.
+
+    Parameters
+    ----------
+    names : sequence of str
+        The texts of the options `--output`. If there are none, the first `MOST_OUTPUTS` of the sets
+        with a known displacement are taken.
     """
     candidates = choose_output_sets(jobs.model, names)
     rows = MotionRows(matrices.dofs, set(jobs.model.held))
-    of_elements = {node for element in jobs.model.mesh.elements.values() for node in element.nodes}
-    eliminated = dict.fromkeys(
+    element_nodes = _nodes_of_elements(jobs.model)
+    free_dofs = {
         dof
         for output in candidates
         for dof in output.dofs()
-        if dof[0] in of_elements and not rows.is_held(dof)
-    )
-    tied = list(eliminated.keys() - set(matrices.dofs))
-    rows = replace(rows, bound=read_tied_motions(jobs, blocks, matrices, sorted(tied)))
+        if dof[0] in element_nodes and not rows.is_held(dof)
+    }
+    tied_dofs = sorted(free_dofs - set(matrices.dofs))
+    rows = replace(rows, bound=read_tied_motions(jobs, blocks, matrices, tied_dofs))
+    # a set has an option `--output` if the user named it
+    options: Sequence[str | None] = names or [None] * len(candidates)
     outputs = [
         movable_output(output, rows, option)
-        for output, option in itertools.zip_longest(candidates, names)
+        for output, option in zip(candidates, options, strict=True)
     ]
     chosen = [output for output in outputs if output is not None]
     return rows, chosen if names else chosen[:MOST_OUTPUTS]
+
+
+def _nodes_of_elements(model: LinearModel) -> set[int]:
+    """Return the nodes that belong to an element of a deck."""
+    return {node for element in model.mesh.elements.values() for node in element.nodes}
 
 
 def _load_rows(
@@ -333,17 +347,17 @@ def _load_rows(
     matrices: StoredMatrices,
     loads: list[DeckLoad],
 ) -> MotionRows:
-    """Return how the loads act on the rows, also on motions that CalculiX has eliminated."""
+    """Return how loads act on the rows of the matrices, also on motions that have no rows there."""
     load_rows = MotionRows(matrices.dofs, set(jobs.model.held))
-    of_elements = {node for element in jobs.model.mesh.elements.values() for node in element.nodes}
-    with_rows = set(matrices.dofs)
-    tied = [
+    element_nodes = _nodes_of_elements(jobs.model)
+    matrix_dofs = set(matrices.dofs)
+    tied_dofs = [
         dof
         for load in loads
         for dof in load_rows.missing(load)
-        if dof[0] in of_elements and dof not in with_rows
+        if dof[0] in element_nodes and dof not in matrix_dofs
     ]
-    with_rotations = {
+    nodes_with_rotations = {
         node
         for element in jobs.model.mesh.elements.values()
         if element.has_rotations
@@ -353,9 +367,9 @@ def _load_rows(
         dof
         for load in loads
         for dof in load_rows.missing_rotations(load)
-        if dof[0] in with_rotations
+        if dof[0] in nodes_with_rotations
     ]
-    bound = read_tied_motions(jobs, blocks, matrices, list(dict.fromkeys(tied)))
+    bound = read_tied_motions(jobs, blocks, matrices, list(dict.fromkeys(tied_dofs)))
     bound |= read_rotations(jobs, blocks, matrices, list(dict.fromkeys(rotations))[:MOST_MOMENTS])
     return MotionRows(matrices.dofs, load_rows.held, bound)
 
@@ -370,7 +384,7 @@ def _gravity_forces(
 
     The rows of held nodes are missing in the mass matrix, but their mass also loads the adjacent
     nodes. For this reason the mass matrix of the structure without supports is multiplied by the
-    acceleration, and the rows of both are matched by name.
+    acceleration, and the rows of both are matched by their degrees of freedom.
     """
     accelerations = {
         load.name: load.acceleration for load in loads if load.acceleration is not None
@@ -390,19 +404,23 @@ def _gravity_forces(
 
 
 def _matched_rows(values: FloatArray, source: StoredMatrices, target: StoredMatrices) -> FloatArray:
-    """Return the values of the target's rows, matched by name and order.
+    """Return the values of the source's rows (n,) for the rows of the target (m,).
 
-    Names with different numbers of rows belong to held nodes; their values are zero.
+    Rows are matched by their degree of freedom. One that CalculiX has expanded, as at a node of a
+    shell, has several rows; these are matched in the order in which they occur. The two sets of
+    matrices differ by the supports alone, so a degree of freedom with different numbers of rows
+    belongs to a held node. Its values are zero.
     """
     source_counts = Counter(source.dofs)
     target_counts = Counter(target.dofs)
     values_of_dof: dict[tuple[int, int], list[float]] = {}
     for dof, value in zip(source.dofs, values.tolist(), strict=True):
         values_of_dof.setdefault(dof, []).append(value)
+    values_to_come = {dof: iter(dof_values) for dof, dof_values in values_of_dof.items()}
     matched = []
     for dof in target.dofs:
-        if source_counts.get(dof) == target_counts[dof]:
-            matched.append(values_of_dof[dof].pop(0))
+        if source_counts[dof] == target_counts[dof]:
+            matched.append(next(values_to_come[dof]))
         else:
             matched.append(0.0)
     return np.array(matched)

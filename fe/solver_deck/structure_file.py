@@ -1,8 +1,7 @@
 """Write a deck as a structure file with matrices and vectors."""
 
 import json
-from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -24,8 +23,8 @@ MASS_FILE = "mass.npz"
 """Name of the file of the mass matrix."""
 PARAMETER = "e"
 """Name of the parameter that scales the moduli of all regions."""
-LARGEST_NAME = 28
-"""Largest length of a set's name in the file, to which an axis is added."""
+LONGEST_NAME = 28
+"""Largest number of letters of a set's name in the file; names of outputs add the axis to it."""
 MOST_OUTPUTS = 12
 """Largest number of sets that become outputs, if none is named."""
 
@@ -88,7 +87,8 @@ def choose_output_sets(model: LinearModel, names: Sequence[str]) -> list[OutputS
     Raises
     ------
     MeshError
-        If a name is no set or number of nodes, or if its axes are not some of x, y, z.
+        If a name is neither that of a set of nodes nor the number of a node, or if its axes are not
+        some of x, y, z.
     """
     if not names:
         return [
@@ -172,7 +172,7 @@ def write_structure_files(structure: DeckStructure, folder: Path, name: str) -> 
         lines += ["", "[[load]]", f'name = "{load.name}"', f'control = "{load.name}_factor"']
         lines += [f'vector = "{_write_load(structure, load, folder)}"']
     for output in structure.output_sets:
-        lines += _output_lines(structure, output, folder)
+        lines += _write_outputs(structure, output, folder)
     file = folder / f"{name}.toml"
     file.write_text("\n".join(lines) + "\n", encoding="utf-8")
     return file
@@ -184,39 +184,42 @@ def _write_load(structure: DeckStructure, load: DeckLoad, folder: Path) -> str:
         file = f"{load.name}.npy"
         np.save(folder / file, structure.load_vectors[load.name])
         return file
-    counts = Counter(structure.matrices.dofs)
+    matrix_dofs = set(structure.matrices.dofs)
     rows = [
         f"{node} {axis} {force!r}"
         for (node, axis), force in sorted(load.forces.items())
-        if (node, axis) in counts and HeldMotion(node, axis) not in structure.model.held
+        if (node, axis) in matrix_dofs and HeldMotion(node, axis) not in structure.model.held
     ]
     file = f"{load.name}.txt"
     (folder / file).write_text("\n".join(rows) + "\n", encoding="ascii")
     return file
 
 
-def _output_lines(structure: DeckStructure, output: OutputSet, folder: Path) -> Iterator[str]:
-    """Yield the lines of the structure file for a set's outputs, and write their vectors.
+def _write_outputs(structure: DeckStructure, output: OutputSet, folder: Path) -> list[str]:
+    """Write the vector of each output of a set; return the lines of the structure file for them.
 
-    The outputs are the mean displacements of the set along its axes. A set of two nodes also gives
-    the strain between them.
+    The outputs are the mean displacements of the set along its axes. A set of two nodes is also a
+    gauge, which reads the strain between them, if the nodes lie at different points and all their
+    translations are degrees of freedom of the matrices.
     """
-    name = name_in_file(output.name)[:LARGEST_NAME]
+    name = name_in_file(output.name)[:LONGEST_NAME]
     if not name[0].isalpha():
-        name = f"n{name}"[:LARGEST_NAME]
-    nodes = output.nodes
-    counts = Counter(structure.matrices.dofs)
+        name = f"n{name}"[:LONGEST_NAME]
+    lines = []
     for letter in output.axes:
         file = _write_mean(structure, output._replace(axes=letter), f"{name}_{letter}", folder)
-        yield from ("", "[[displacement]]", f'name = "{name}_{letter}"', f'vector = "{file}"')
-    have_rows = all((node, axis) in counts for node in nodes for axis in TRANSLATIONS)
-    if len(nodes) == 2 and have_rows:
+        lines += ["", "[[displacement]]", f'name = "{name}_{letter}"', f'vector = "{file}"']
+    nodes = output.nodes
+    matrix_dofs = set(structure.matrices.dofs)
+    translations = {(node, axis) for node in nodes for axis in TRANSLATIONS}
+    if len(nodes) == 2 and translations <= matrix_dofs:
         first, second = (structure.model.mesh.points[node] for node in nodes)
         span = second - first
         length = float(np.linalg.norm(span))
         if length > 0.0:
-            yield from ("", "[[gauge]]", f'name = "{name}"', f"nodes = {nodes}")
-            yield from (f"direction = {(span / length).tolist()}", f"length = {length!r}")
+            lines += ["", "[[gauge]]", f'name = "{name}"', f"nodes = {nodes}"]
+            lines += [f"direction = {(span / length).tolist()}", f"length = {length!r}"]
+    return lines
 
 
 def _write_mean(structure: DeckStructure, output: OutputSet, name: str, folder: Path) -> str:

@@ -83,19 +83,19 @@ def with_interfaces(mesh: StructureMesh, design: MeshDesign) -> StructureMesh:
     return mesh
 
 
-def _with_interface(mesh: StructureMesh, interface: Interface, where: str) -> StructureMesh:
+def _with_interface(mesh: StructureMesh, interface: Interface, label: str) -> StructureMesh:
     """Return the mesh with one more interface."""
-    first_cells, second_cells = (mesh.cells_of(part, where) for part in interface.parts)
+    first_cells, second_cells = (mesh.cells_of(part, label) for part in interface.parts)
     words = " and ".join(map(repr, interface.parts))
     if np.intersect1d(first_cells, second_cells).size:
         raise MeshError(
-            f"{where}: the parts {words} share elements; give two sets of elements that only touch."
+            f"{label}: the parts {words} share elements; give two sets of elements that only touch."
         )
     of_first = np.unique(mesh.cells[first_cells])
     of_second = np.unique(mesh.cells[second_cells])
     nodes = np.intersect1d(of_first, of_second)
     if nodes.size:
-        _check_no_third_part(mesh, nodes, np.union1d(first_cells, second_cells), where)
+        _check_no_third_part(mesh, nodes, np.union1d(first_cells, second_cells), label)
         copies = len(mesh.points) + np.arange(len(nodes))
         divided = _with_copies(mesh, nodes, second_cells)
     else:
@@ -105,33 +105,34 @@ def _with_interface(mesh: StructureMesh, interface: Interface, where: str) -> St
         nodes, copies = of_first[nearest[is_at_node]], of_second[is_at_node]
     if not nodes.size:
         raise MeshError(
-            f"{where}: the parts {words} have no node in common, and no nodes at the same places; "
+            f"{label}: the parts {words} have no node in common, and no nodes at the same places; "
             "mesh them so that their nodes agree where they touch."
         )
     for other in mesh.interfaces:
         if np.isin(nodes, (other.nodes, other.copies)).any():
             raise MeshError(
-                f"{where}: some of its nodes belong to the interface {other.name!r}, too; "
+                f"{label}: some of its nodes belong to the interface {other.name!r}, too; "
                 "interfaces must not meet."
             )
-    direction = mesh.centres[second_cells].mean(axis=0) - mesh.centres[first_cells].mean(axis=0)
+    first_centre = mesh.centres[first_cells].mean(axis=0)
+    second_centre = mesh.centres[second_cells].mean(axis=0)
     new_interface = MeshInterface(
         name=interface.name,
         nodes=nodes,
         copies=copies,
-        centre=_centre(mesh, first_cells, nodes, where),
-        axes=_axes(mesh.points[nodes], direction, where),
+        centre=_centre(mesh, first_cells, nodes, label),
+        axes=_interface_axes(mesh.points[nodes], second_centre - first_centre, label),
     )
     return replace(divided, interfaces=(*mesh.interfaces, new_interface))
 
 
-def _check_no_third_part(mesh: StructureMesh, nodes: IntArray, cells: IntArray, where: str) -> None:
+def _check_no_third_part(mesh: StructureMesh, nodes: IntArray, cells: IntArray, label: str) -> None:
     """Raise `MeshError` if a cell of neither part has one of the shared nodes."""
     touching = np.flatnonzero(np.isin(mesh.cells, nodes).any(axis=1))
     others = np.setdiff1d(touching, cells)
     if others.size:
         raise MeshError(
-            f"{where}: {len(others)} elements of neither part touch the interface, such as "
+            f"{label}: {len(others)} elements of neither part touch the interface, such as "
             f"{mesh.describe_cell(others[0])}; add them to the part to which they belong."
         )
 
@@ -170,44 +171,51 @@ def _with_copies(mesh: StructureMesh, nodes: IntArray, second_cells: IntArray) -
     )
 
 
-def _centre(mesh: StructureMesh, first_cells: IntArray, nodes: IntArray, where: str) -> FloatArray:
+def _centre(mesh: StructureMesh, first_cells: IntArray, nodes: IntArray, label: str) -> FloatArray:
     """Return the centre (3,) of the faces between the nodes of an interface [m]."""
+    set_name = label  # of the nodes, as a message would call them
     first_part = replace(
         mesh,
         cells=mesh.cells[first_cells],
         cell_numbers=mesh.cell_numbers[first_cells],
-        node_sets={where: nodes},
+        node_sets={set_name: nodes},
         cell_sets={},
         face_sets={},
         interfaces=(),
     )
-    return set_weights(first_part, where, where) @ mesh.points
+    return set_weights(first_part, set_name, label) @ mesh.points
 
 
-def _axes(points: FloatArray, direction: FloatArray, where: str) -> FloatArray:
-    """Return the normal, the long and the short axis (3, 3) of an interface, as rows.
+def _interface_axes(points: FloatArray, to_second_part: FloatArray, label: str) -> FloatArray:
+    """Return the normal, the long and the short axis of an interface, as unit rows (3, 3).
 
-    The normal is that of the plane nearest to the points (m, 3); it has the side of the direction
-    (3,), which leads to the second part. The axes have no sense of their own: their largest
-    component is positive. Without a longer extent the first is the most tangential coordinate axis.
+    - The normal is that of the plane nearest to the points (m, 3). It points to the side to which
+      `to_second_part` (3,) points.
+    - The long axis is the direction in the plane in which the points extend farthest. If the
+      extents are about equal, it is the projection on the plane of that coordinate axis which is
+      most nearly tangential. Its component of largest magnitude is positive.
+    - The short axis is the cross product of the normal and the long axis.
+
+    `label` of the interface begins the message of an error.
 
     Raises
     ------
     MeshError
-        If the points lie on a line.
+        If there are fewer than three points, or if they lie on a line.
     """
     _, extents, axes = np.linalg.svd(points - points.mean(axis=0), full_matrices=True)
     if len(points) < 3 or extents[1] <= LEAST_EXTENT * extents[0]:
         raise MeshError(
-            f"{where}: the nodes of the interface lie on a line, about which the parts could turn "
+            f"{label}: the nodes of the interface lie on a line, about which the parts could turn "
             "freely."
         )
     long_axis, _, normal = axes
-    if normal @ direction < 0.0:
+    if normal @ to_second_part < 0.0:
         normal = -normal
     if extents[1] > EQUAL_EXTENTS * extents[0]:
         long_axis = np.eye(3)[np.argmin(np.round(np.abs(normal), 6))]
         long_axis = long_axis - (long_axis @ normal) * normal
         long_axis = long_axis / np.linalg.norm(long_axis)
     long_axis = long_axis * np.sign(long_axis[np.abs(long_axis).argmax()])
-    return np.array([normal, long_axis, np.cross(normal, long_axis)])
+    short_axis = np.cross(normal, long_axis)
+    return np.array([normal, long_axis, short_axis])

@@ -130,24 +130,29 @@ class VariableInfo:
         """The unit with a blank before it, for a message; empty if the variable has no unit."""
         return "" if self.unit in (None, "1") else f" {self.unit}"
 
-    def resized(self, lengths: Mapping[str | None, int]) -> "VariableInfo":
-        """Return the variable with array lengths for new values of structural parameters.
+    def with_lengths(self, value_of_parameter: Mapping[str, int]) -> "VariableInfo":
+        """Return the variable with its shape for new values of structural parameters.
 
-        If all elements have the same start value, new elements have it as well.
+        If all start values are equal, `start` becomes this single value, which applies to all
+        elements of an array of any size. Different start values are kept as they are, although
+        their number may not fit the new shape.
 
         Parameters
         ----------
-        lengths : mapping of str to int
-            The new values by parameter; the others keep theirs.
+        value_of_parameter : mapping of str to int
+            The new values of structural parameters by their names. Lengths that depend on none of
+            them do not change.
 
         Raises
         ------
         FmuInputError
-            If the array would have too many elements.
+            If a length is negative, or the array would have too many elements.
         """
         shape = []
         for parameter, length in zip(self.dimensions, self.shape, strict=True):
-            shape.append(lengths.get(parameter, length))
+            if parameter is not None:
+                length = value_of_parameter.get(parameter, length)
+            shape.append(length)
         start = self.start
         different_values = set((start or "").split())
         if len(different_values) == 1:

@@ -242,29 +242,32 @@ class Binding(Section):
                 health[name] = self.health[name]
         return self.model_copy(update={"health": health})
 
-    def with_arrays(self, elements: Callable[[str], Sequence[str]]) -> "Binding":
+    def with_arrays(self, element_names_of: Callable[[str], Sequence[str]]) -> "Binding":
         """Return the binding with every observed or recorded array replaced by its elements.
 
         Parameters
         ----------
-        elements : callable
-            Returns the names of the elements of a variable; the name itself for a scalar.
+        element_names_of : callable
+            Returns the names of the elements of a variable, given its name. For a scalar it returns
+            a sequence that contains this name only.
         """
         monitor = {}
         for key, scalar in self.monitor.items():
-            names = elements(scalar.variable)
+            names = element_names_of(scalar.variable)
             for number, name in enumerate(names, 1):
                 label = key if len(names) == 1 else f"{key}[{number}]"
                 monitor[label] = scalar.model_copy(update={"variable": name})
         recorded_names: list[str] = []
         for name in self.record.variables:
-            recorded_names += elements(name)
-        observation = {key: vector.by_element(elements) for key, vector in self.observation.items()}
+            recorded_names += element_names_of(name)
+        observation = {
+            key: vector.by_element(element_names_of) for key, vector in self.observation.items()
+        }
         return self.model_copy(
             update={
                 "observation": observation,
                 "monitor": monitor,
-                "port": {key: port.by_element(elements) for key, port in self.port.items()},
+                "port": {key: port.by_element(element_names_of) for key, port in self.port.items()},
                 "record": self.record.model_copy(update={"variables": tuple(recorded_names)}),
             }
         )

@@ -507,12 +507,12 @@ class Blocks:
         _check_version(description, binding)
         description, configuration = with_structural_parameters(description, binding)
 
-        def elements(name: str) -> Sequence[str]:
+        def element_names_of(name: str) -> Sequence[str]:
             variable = description.variable(name)
             return (name,) if variable is None else variable.elements
 
         self.description = description
-        self.binding = binding.with_arrays(elements)
+        self.binding = binding.with_arrays(element_names_of)
         fmu = BoundFmu(description, self.binding)
         faults = BindingFaults(binding.title)
         ports = fmu.port_quantities(faults)

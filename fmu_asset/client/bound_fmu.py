@@ -486,7 +486,7 @@ def with_structural_parameters(
         If a value is not a whole number or out of range, or makes an array too large.
     """
     settings = []
-    lengths: dict[str | None, int] = {}
+    value_of_parameter: dict[str, int] = {}
     for name, value in binding.binding.structural_parameters.items():
         label = f"structural_parameters.{name}"
         location = f"{label} of the binding {binding.title}"
@@ -495,13 +495,15 @@ def with_structural_parameters(
         size = BoundInput(label, (0,), low, high, IDENTITY, variable)
         numbers = size.numbers(value).tolist()
         settings.append(InitialValue(variable.kind, variable.reference, numbers))
-        lengths[name] = int(numbers[0])
-    if not lengths:
+        value_of_parameter[name] = int(numbers[0])
+    if not value_of_parameter:
         return description, settings
     if description.interface == "model-exchange":
         raise BindingError(
             f"{description.label} is run by model exchange; structural parameters are set in "
             "co-simulation only."
         )
-    resized = tuple(variable.resized(lengths) for variable in description.variables)
-    return replace(description, variables=resized), settings
+    variables = tuple(
+        variable.with_lengths(value_of_parameter) for variable in description.variables
+    )
+    return replace(description, variables=variables), settings

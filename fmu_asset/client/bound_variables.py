@@ -140,18 +140,21 @@ class VectorBinding(Section):
             return (self.unit,) * len(self.variables)
         return self.unit
 
-    def by_element(self, elements: Callable[[str], Sequence[str]]) -> Self:
-        """Return the vector with each array among its variables replaced by the elements.
+    def by_element(self, element_names_of: Callable[[str], Sequence[str]]) -> Self:
+        """Return the vector with the name of each array replaced by the names of its elements.
+
+        Each element has the unit of its array.
 
         Parameters
         ----------
-        elements : callable
-            Returns the names of the elements of a variable; the name itself for a scalar.
+        element_names_of : callable
+            Returns the names of the elements of a variable, given its name. For a scalar it returns
+            a sequence that contains this name only.
         """
         names: list[str] = []
         units: list[str] = []
         for name, unit in zip(self.variables, self.units, strict=True):
-            element_names = elements(name)
+            element_names = element_names_of(name)
             names += element_names
             units += [unit] * len(element_names)
         unit_of_vector = self.unit if isinstance(self.unit, str) else tuple(units)
@@ -207,11 +210,11 @@ class PortBinding(Section):
         }
         return {name: vector for name, vector in vectors.items() if vector is not None}
 
-    def by_element(self, elements: Callable[[str], Sequence[str]]) -> Self:
-        """Return the port with each array replaced by its elements; see `VectorBinding`."""
+    def by_element(self, element_names_of: Callable[[str], Sequence[str]]) -> Self:
+        """Return the port with the vectors of its quantities as `VectorBinding.by_element` does."""
         changed_vectors = {}
         for name, vector in self.quantities.items():
-            changed_vectors[name] = vector.by_element(elements)
+            changed_vectors[name] = vector.by_element(element_names_of)
         return self.model_copy(update=changed_vectors)
 
 

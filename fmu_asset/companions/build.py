@@ -10,7 +10,7 @@ from dataclasses import asdict
 from importlib.resources import files
 
 from fmu_asset.description import PLACEHOLDER, Declaration
-from fmu_asset.packing.contents import python_members, sealed
+from fmu_asset.packing.contents import python_members, seal_fmu
 from fmu_asset.slaves.variables import VariableTable
 from reporting.formats.toml_file import TomlTable
 
@@ -53,7 +53,7 @@ def companion_bytes(name: str) -> bytes:
     packed_folder = f"resources/{name}_{PLACEHOLDER}_runtime/companions"
     members[f"{packed_folder}/__init__.py"] = b'"""The behaviour of the FMU."""\n'
     members[f"{packed_folder}/{name}.py"] = (folder / f"{name}.py").read_bytes()
-    return sealed(members).content
+    return seal_fmu(members).content
 
 
 def companion_declaration(name: str, description: TomlTable) -> Declaration:

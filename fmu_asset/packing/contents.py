@@ -282,30 +282,31 @@ def guid_of_hash(content_hash: str) -> str:
     return f"{{{UUID(content_hash[:32])}}}"
 
 
-def sealed(
+def seal_fmu(
     template: Mapping[str, bytes],
     make_binaries: Callable[[dict[str, bytes], str], dict[str, bytes]] | None = None,
 ) -> SealedFmu:
     """Replace the placeholder in an FMU's files by their hash, and pack them.
 
-    The hash is taken over the names and contents of the files with the placeholder. Equal files
-    therefore give equal bytes.
+    The hash is that of the names and contents of all files of the template, before the placeholder
+    is replaced. Without further files, equal templates therefore give equal bytes.
 
     Parameters
     ----------
     template : mapping of str to bytes
-        The files by name, with the placeholder.
+        The files by name, in which the placeholder stands for tag and GUID.
     make_binaries : callable, optional
-        Returns further files, given the files with their hash, and the tag: the first digits of the
-        hash. They are not part of the hash.
+        Returns further files, which are not part of the hash. It is called with the files in which
+        the placeholder was replaced, and with the tag: the first digits of the hash.
     """
     content_hash = hash_members(template)
     tag = content_hash[: len(PLACEHOLDER)]
     identity = ContentIdentity(tag=tag, guid=guid_of_hash(content_hash))
-    members = with_identity(template, UNKNOWN_IDENTITY, identity)
+    identified_members = with_identity(template, UNKNOWN_IDENTITY, identity)
     if make_binaries is not None:
-        members |= make_binaries(members, tag)
-    return SealedFmu(archive_bytes(members, "modelDescription.xml"), identity.guid)
+        identified_members |= make_binaries(identified_members, tag)
+    archive = archive_bytes(identified_members, "modelDescription.xml")
+    return SealedFmu(archive, identity.guid)
 
 
 def with_identity(

@@ -33,7 +33,7 @@ from .contents import (
     checked_target,
     pythonfmu_members,
     pythonfmu_version,
-    sealed,
+    seal_fmu,
     write_fmu,
 )
 
@@ -92,7 +92,7 @@ def script_fmu(script: str | os.PathLike[str]) -> SealedFmu:
     }
     names = ("__init__.py", "builder.py", "osutil.py", *BASE_CLASS_FILES)
     members |= pythonfmu_members(module, "resources/pythonfmu", names)
-    return sealed(members)
+    return seal_fmu(members)
 
 
 def _model_class(file: Path) -> "type[Fmi2Slave]":

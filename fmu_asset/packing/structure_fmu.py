@@ -39,7 +39,7 @@ from fmu_asset.packing.contents import (
     guid_of_hash,
     package_members,
     python_members,
-    sealed,
+    seal_fmu,
     with_identity,
     write_fmu,
 )
@@ -178,7 +178,7 @@ def build_fmu(
     def make_binaries(members: dict[str, bytes], tag: str) -> dict[str, bytes]:
         return compiled_binaries(members, f"{declaration.name}_{tag}", fmi, platforms)
 
-    fmu = sealed(template, make_binaries if kind == "compiled" else None)
+    fmu = seal_fmu(template, make_binaries if kind == "compiled" else None)
     return write_fmu(target, fmu, model.design_hash)
 
 
@@ -361,7 +361,7 @@ def recorded_content_hash(path: str | os.PathLike[str]) -> tuple[str, str]:
         identifier = description.split('modelIdentifier="', 1)[1].split('"', 1)[0]
     else:
         identifier = members["resources/slavemodule.txt"].decode("ascii").strip()
-    # Put the placeholder back in the place of tag and GUID, and take the hash as in `sealed`.
+    # Put the placeholder back in the place of tag and GUID, and take the hash as in `seal_fmu`.
     tag = identifier[-len(PLACEHOLDER) :]
     match = re.search(r'(?:guid|instantiationToken)="([^"]*)"', description)
     declared_guid = "" if match is None else match[1]

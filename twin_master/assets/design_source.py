@@ -398,7 +398,7 @@ class DesignSource(_WingSource, ReducedModelSource):
 
         The axes are the draw of the parameter, the state, the control and the gauge.
         """
-        return self._predict_strains(draws, model, self.patch)
+        return self._strains_with_patch(draws, model, self.patch)
 
     def structural_table(self, draws: ParameterDraws, model: GraphicalModel) -> Float | None:
         """Return the strains (E, S, U, G) of the structure, without the errors of its gauges.
@@ -411,14 +411,14 @@ class DesignSource(_WingSource, ReducedModelSource):
         structural_patch = self.patch.of_structure
         if structural_patch == self.patch:
             return None
-        return self._predict_strains(draws, model, structural_patch)
+        return self._strains_with_patch(draws, model, structural_patch)
 
-    def _predict_strains(
+    def _strains_with_patch(
         self, draws: ParameterDraws, model: GraphicalModel, patch: "PatchFile | None"
     ) -> Float:
-        """Return the strains (E, S, U, G) that the twin predicts with the effects of a patch.
+        """Return the strains (E, S, U, G) of the reduced model with the effects of a patch added.
 
-        Without effects, they are the strains of the reduced model alone.
+        They are predicted for E draws of the parameter, S states, U controls and G gauges.
 
         Raises
         ------
@@ -426,20 +426,21 @@ class DesignSource(_WingSource, ReducedModelSource):
             If the model cannot carry the patch.
         """
         if patch is None or not patch.effects:
+            # the table of the parent class is that of the reduced model without effects
             return super().observation_table(draws, model)
         from fmu_asset.packing.structure_fmu import needed_patch_arrays
         from fmu_asset.slaves.contents import UnacceptableValuesError
 
         scenario = self._scenario
         patch_arrays = needed_patch_arrays(self.wing_design, patch)
-        predict_strains = strain_predictor(self.prepared_model, patch, patch_arrays)
+        predictor = strain_predictor(self.prepared_model, patch, patch_arrays)
         tip_force = scenario.asset.constant_load.get("tip_force", 0.0)
         tables = []
-        before = f"the twin's model cannot carry {self.patch_path}: "
-        with MissionInputError.instead_of(UnacceptableValuesError, before=before):
+        message_start = f"the twin's model cannot carry {self.patch_path}: "
+        with MissionInputError.instead_of(UnacceptableValuesError, before=message_start):
             for young_modulus_factor in draws.values.tolist():
-                predict = partial(predict_strains, young_modulus_factor, tip_force)
-                table = table_of_observations(scenario, model.states.coordinates, predict)
+                strains_of_draw = partial(predictor, young_modulus_factor, tip_force)
+                table = table_of_observations(scenario, model.states.coordinates, strains_of_draw)
                 tables.append(table)
         return np.array(tables)
 

@@ -425,25 +425,31 @@ class WatchfulEstimator:
         )
 
     def smoothed(self, carried: Sequence[Carried]) -> Float:
-        """Return p(D_k | o_0..o_t) for the steps of `carried`, which end at t: (n, S).
+        """Return p(D_k | o_0..o_t) over S states for n consecutive steps k, up to step t: (n, S).
 
-        The result is the average of two smoothed beliefs, weighted by the probability of the model
-        in the last step. Under the model, the inner estimator smooths. Under the competing
-        hypotheses, approximately, the mixed beliefs of the steps are smoothed, starting from the
-        belief under the competing hypotheses in the last step.
+        It is the average of the smoothed beliefs under the model and under the competing
+        hypotheses, weighted by the probability of the model in step t, and one minus it. Under the
+        model the inner estimator smooths. For the competing hypotheses, a backward pass from their
+        belief in step t smooths the mixed beliefs of the steps before, which is approximate.
+
+        Parameters
+        ----------
+        carried : sequence of Carried
+            The arrays that the estimator carried on from each of the n steps.
         """
-        under_model = self._inner.smoothed(carried)
+        smoothed_by_model = self._inner.smoothed(carried)
         if not carried:
-            return under_model
+            return smoothed_by_model
         stored_beliefs = [StoredBelief.from_arrays(step.arrays) for step in carried]
         last_step = stored_beliefs[-1]
         with np.errstate(divide="ignore"):
             log_beliefs = np.log([stored_belief.belief for stored_belief in stored_beliefs])
             log_beliefs[-1] = np.log(last_step.competing_belief)
         controls = [step.control_index for step in carried]
-        competing = smooth(self.model, controls, log_beliefs)
+        smoothed_by_competitors = smooth(self.model, controls, log_beliefs)
+        model_weight = last_step.model_weight
         return np.asarray(
-            last_step.model_weight * under_model + (1.0 - last_step.model_weight) * competing
+            model_weight * smoothed_by_model + (1.0 - model_weight) * smoothed_by_competitors
         )
 
     def for_smoothing(self, carried: Carried) -> Carried:

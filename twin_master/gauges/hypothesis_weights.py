@@ -128,30 +128,38 @@ class HypothesisWeights:
         )
 
     def change_controls(self, previous_control: Index, control: Index) -> Float:
-        """Change the controls of B twins, given by arrays (B,), as `change_control` does for one.
+        """Update the weights of B twins in place for their new controls, see `change_control`.
+
+        Parameters
+        ----------
+        previous_control, control : (B,) array
+            The indices of the controls before and after the change. Twins in which they are equal
+            do not change.
 
         Returns
         -------
         (B, 1 + G K) array
-            The increase of p(fault, hidden) for each fault; 0 where it decreases.
+            The increase of p(fault, hidden), the probability that a fault exists and does not show,
+            for free gains, then for each of K gain errors of each of G gauges. It is 0 where this
+            probability decreases.
         """
         newly_hidden = np.zeros_like(self.hidden)
         pairs = np.stack([previous_control, control], axis=1)
-        for previous, present in np.unique(pairs, axis=0).tolist():
-            if previous == present:
+        for old_control, new_control in np.unique(pairs, axis=0).tolist():
+            if old_control == new_control:
                 continue
-            twins = np.flatnonzero(np.all(pairs == [previous, present], axis=1))
+            twins = np.flatnonzero(np.all(pairs == [old_control, new_control], axis=1))
             weights = HypothesisWeights(
                 self.current[twins], self.hidden[twins], self.showing[twins]
             )
-            newly_hidden[twins] = weights.change_control(previous, present)
+            newly_hidden[twins] = weights.change_control(old_control, new_control)
             self.current[twins] = weights.current
             self.hidden[twins] = weights.hidden
             self.showing[twins] = weights.showing
         return newly_hidden
 
     def change_control(self, previous_control: int, control: int) -> Float:
-        """Split the probability of each fault into a visible and a hidden part for a new control.
+        """Split the probability of each fault into a visible and a hidden part, in place.
 
         A fault may be visible in the readings under one control and hidden under another. Its total
         probability does not change with the control:

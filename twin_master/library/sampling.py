@@ -200,17 +200,23 @@ def _sample_blocks(
 
 def _check_grid(grid: SamplingGrid, binding: Binding) -> None:
     """Refuse a grid with names that the binding does not have, or with unusable values."""
+    # the parameters with one value at all points, and the uncertain one, which varies
     parameter_names = list(grid.parameters)
     if grid.parameter:
         parameter_names.append(grid.parameter)
-    control_inputs = next(iter(grid.controls.values()), {})
+    # all controls set the same inputs, so that the names of the first one are enough
+    first_control = next(iter(grid.controls.values()), {})
     names_by_kind = (
         ("state", grid.states, binding.health),
-        ("control input", control_inputs, binding.control),
+        ("control input", first_control, binding.control),
         ("load", grid.load, binding.load),
         ("parameter", parameter_names, binding.parameter),
     )
-    check_names("the grid has the", f"the binding {binding.name}", names_by_kind)
+    check_names(
+        owner="the grid has the",
+        reference=f"the binding {binding.name}",
+        rows=names_by_kind,
+    )
     binding.observation_slice(grid.role)  # raises an error for an unknown role
     if not grid.states or not grid.controls or not grid.draws:
         raise MissionInputError(

@@ -272,7 +272,13 @@ class Estimator(Protocol):
         """
 
     def smoothed(self, carried: Sequence[Carried]) -> Float:
-        """Return p(D_k | o_0..o_t) for the steps of `carried`, which end at t: (n, S)."""
+        """Return p(D_k | o_0..o_t) over S states for n consecutive steps k, up to step t: (n, S).
+
+        Parameters
+        ----------
+        carried : sequence of Carried
+            What was carried on from each of the n steps; empty if n is 0.
+        """
 
 
 @dataclass(frozen=True)

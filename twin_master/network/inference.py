@@ -456,7 +456,7 @@ class ExactFilter:
         return beliefs, errors
 
     def smoothed(self, carried: Sequence[Carried]) -> Float:
-        """Return p(D_k | o_0..o_t) for the steps of `carried`, which end at t: (n, S)."""
+        """Return p(D_k | o_0..o_t) for n consecutive steps k, up to t; see `Estimator.smoothed`."""
         controls = [step.control_index for step in carried]
         log_filtered = np.array([step.arrays["log_filtered"] for step in carried])
         # The shape is given because there may be no steps.

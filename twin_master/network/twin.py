@@ -126,8 +126,8 @@ class DecisionRule:
     ) -> tuple[Float, Index, Index]:
         """Decide on the next control of each of B twins: the most probable one.
 
-        If the policy has a `Hold`, a change to a harder control waits until it was proposed often
-        enough in a row.
+        With a `Hold`, a change to a harder control waits until harder controls have been proposed
+        often enough in a row.
 
         Parameters
         ----------
@@ -141,9 +141,10 @@ class DecisionRule:
         Returns
         -------
         probability : (B, U) array
-            The probability of each next control; held changes are taken out.
+            The probability of each next control. While a change is held back, the probability of
+            all harder controls is added to that of the control in force.
         next_control : (B,) array
-            The most probable next control, the first of equals.
+            The index of the most probable next control; the first one on a tie.
         proposals : (B,) array
             How often in a row a harder control was proposed, this step included; 0 without a
             `Hold`.
@@ -167,7 +168,7 @@ class TwinStep(Estimate):
     decision_probability : (U,) array
         policy(U | D) averaged over the belief on which the twin decides.
     next_control : int
-        The most probable next control, the first of equals: the control to fly in step t + 1.
+        The index of the control to fly in step t + 1: the most probable one, or the first on a tie.
     """
 
     step: int

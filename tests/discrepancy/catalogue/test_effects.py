@@ -411,9 +411,9 @@ def test_steps_of_sizes_are_straight_in_the_value(u, step):
     prior = Prior("log_normal", 0.01, 1.0)
     slope = (prior.value(u + 1e-6) - prior.value(u - 1e-6)) / 2e-6
     target = prior.value(u) + slope * step
-    reached = prior.value(prior.step_within_prior(u, step))
+    reached = prior.value(prior.step_along_tangent(u, step))
     assert reached == pytest.approx(max(target, LEAST_SHRINKAGE * prior.value(u)), rel=1e-6)
-    assert Prior("normal", -1.0, 1.0).step_within_prior(u, step) == u + step
+    assert Prior("normal", -1.0, 1.0).step_along_tangent(u, step) == u + step
 
 
 # ---------------------------------------------------------------- on lumped models

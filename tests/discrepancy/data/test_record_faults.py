@@ -50,8 +50,10 @@ def test_a_channel_that_is_another_one(copy, how, digit):
 
     fault = only(check_data(campaign_of(spoil)), FaultKind.COPIED)
     assert fault.fatal
-    assert f"The channel 'y' is the channel 'x' {how} the column 'y [mm]' of 0.csv" in fault.sentence
-    assert "(the trial 'ring 0', 0 to 7.995 s), and so in 1 more of its trials" in fault.sentence
+    assert (
+        f"The channel 'y' is a copy of the channel 'x' {how} the column 'y [mm]' of 0.csv" in fault.sentence
+    )
+    assert "(the trial 'ring 0', 0 to 7.995 s), and in 1 more trial" in fault.sentence
 
 
 def oscillation_without_noise(values):

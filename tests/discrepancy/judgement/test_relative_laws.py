@@ -243,7 +243,7 @@ def test_a_prescribed_state_does_not_go_in_steps() -> None:
     pump, sea = trial.inputs
     stepped = replace(trial, inputs=(pump, replace(sea, hold=Hold.ZERO_ORDER)))
     outputs = (("tank", Quantity.LEVEL),)
-    with pytest.raises(ModelError, match=r"is a state that .* prescribes, which no drive makes in steps"):
+    with pytest.raises(ModelError, match=r"is a state that .* prescribes, and no drive goes in steps"):
         model_of(TANK).respond(stepped, outputs, ModelPatch(), Conditions(np.array([1.0])))
 
 

@@ -92,7 +92,7 @@ class TransitionFamily:
         The names of the probabilities: the control, and the factor if each has its own.
     assumed : (K,) array
         The probabilities that the scenario assumes.
-    lists : PredecessorLists
+    predecessors : PredecessorLists
         The predecessors of the levels of each factor of the state.
     parameter_index : (non-zeros,) array
         The index of the probability on which each entry of the lists depends.
@@ -106,7 +106,7 @@ class TransitionFamily:
 
     names: tuple[str, ...]
     assumed: Float
-    lists: PredecessorLists
+    predecessors: PredecessorLists
     parameter_index: Index
     entries_at_zero: Float
     entries_at_one: Float
@@ -121,7 +121,7 @@ class TransitionFamily:
         return cls(
             names=(),
             assumed=np.empty(0),
-            lists=lists,
+            predecessors=lists,
             parameter_index=np.zeros(len(entries), dtype=np.int64),
             entries_at_zero=entries,
             entries_at_one=entries,
@@ -145,7 +145,7 @@ class TransitionFamily:
         return cls(
             names=tuple(cause.name for cause in probabilities),
             assumed=np.array(list(probabilities.values())),
-            lists=lists,
+            predecessors=lists,
             parameter_index=_parameter_index(scenario, list(probabilities), lists),
             entries_at_zero=entries - slope * low,
             entries_at_one=entries + slope * (1.0 - low),
@@ -158,7 +158,7 @@ class TransitionFamily:
 
         A set is a number whose bit k says whether probability k belongs to it.
         """
-        levels, first_row, start, _, _, _ = self.lists
+        levels, first_row, start, _, _, _ = self.predecessors
         is_changed = self.entries_at_zero != self.entries_at_one
         # Each block has a row for each control and level.
         end_row = np.append(first_row[1:], len(start) - 1)
@@ -229,27 +229,33 @@ def scaled(log_likelihood: Float) -> tuple[Float, Float]:
 def transition_evidence(
     family: TransitionFamily, points: Float, log_likelihood: Float, control: Index
 ) -> Float:
-    """Return the log evidence of B twins at P points: sets of values of the K probabilities.
+    """Return the log evidence of the observations of B twins at P points.
+
+    A point has a value for each of the K probabilities of worsening. The evidence is that of the T
+    observations o_t under the controls u_t, with the S states D_t summed out.
 
     Parameters
     ----------
     points : (P, K) array
-        The probabilities with which damage grows, between 0 and 1.
+        The values of the probabilities of worsening at each point, between 0 and 1.
     log_likelihood : (B, T, S) array
-        log p(o_t | D_t, u_t).
+        log p(o_t | D_t, u_t) of each twin, in each step and state.
     control : (B, T) array
-        The control in force in each step.
+        The index of the control u_t in force in each step.
 
     Returns
     -------
     (B, P) array
         The log evidence; -inf if the observations of a twin are impossible.
     """
-    result = np.empty((len(control), len(points)))
-    entries = np.ascontiguousarray(family.entries(points).T)
+    # each point is a lane of the compiled loop: a hidden Markov model with transitions of its own
+    entries = np.ascontiguousarray(family.entries(points).T)  # (non-zeros, P)
     log_density = np.ascontiguousarray(log_likelihood)[..., None]  # the same at all points
-    evidence_in_lanes(family.prior, family.lists, entries, control, log_density, result)
-    return result
+    log_evidence = np.empty((len(control), len(points)))  # filled by the loop
+    evidence_in_lanes(
+        family.prior, family.predecessors, entries, control, log_density, log_evidence
+    )
+    return log_evidence
 
 
 def sub_grids(family: TransitionFamily, axes: Axes) -> SubGrids:
@@ -314,7 +320,7 @@ def grid_evidence(family: TransitionFamily, axes: Axes, likelihood: Float, contr
         return transition_evidence(family, np.empty((1, 0)), _log(likelihood), control)
     result = np.empty((len(control), math.prod(len(axis) for axis in axes)))
     grids = sub_grids(family, axes)
-    evidence_on_grid(family.prior, family.lists, grids, control, likelihood, result)
+    evidence_on_grid(family.prior, family.predecessors, grids, control, likelihood, result)
     is_improbable = ~(result > LEAST_EVIDENCE).all(axis=1)
     if is_improbable.any():
         points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, len(axes))

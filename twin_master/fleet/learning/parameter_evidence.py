@@ -178,5 +178,7 @@ def _twins_at_nodes(
         log_density = model.log_density_of_draws(all_steps, some_control.ravel())
         log_density = log_density.reshape(-1, step_count, model.state_count, model.draw_count)
         evidence = np.empty((len(some_control), model.draw_count))
-        evidence_in_lanes(family.prior, family.lists, entries, some_control, log_density, evidence)
+        evidence_in_lanes(
+            family.prior, family.predecessors, entries, some_control, log_density, evidence
+        )
         yield log_density, evidence
