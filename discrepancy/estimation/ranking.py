@@ -33,8 +33,8 @@ BEAM_WIDTHS = (4, 2, 2)
 ESTIMATED_RANGE = 60.0
 """Difference to the best score above which a hypothesis is not estimated in full [nat]."""
 RANGE_BESIDE_NO_FORCE = 6.0
-"""The same difference where the best hypothesis leaves no force [nat]: what is added is then small,
-and its rough estimate nearly exact."""
+"""The same difference to the hypothesis to which an effect is added, if that leaves no force [nat]:
+the effect is then small, and its rough estimate nearly exact."""
 LEAST_LOSS = 0.5
 """Evidence by which an estimate must be below its rough one to count as another optimum [nat]."""
 MOST_SETTLING_ESTIMATES, LEAST_SETTLING_RISE = 4, 2.0
@@ -232,9 +232,12 @@ class _Ranking:
             if self.score(rough_estimate) < self.score(rough_estimates[0]) - ESTIMATED_RANGE:
                 break
             # where nothing is left to explain, another effect cannot explain more
-            best_estimate = self.best
-            least_score = self.score(best_estimate) - RANGE_BESIDE_NO_FORCE
-            if best_estimate.leaves_no_force and self.score(rough_estimate) < least_score:
+            reference = base if base.leaves_no_force else self.best
+            score_range = RANGE_BESIDE_NO_FORCE if base.leaves_no_force else ESTIMATED_RANGE
+            if (
+                reference.leaves_no_force
+                and self.score(rough_estimate) < self.score(reference) - score_range
+            ):
                 break
             candidate = rough_estimate.candidate
             self.on_progress(f"estimating {candidate.description} together with the motion")
