@@ -160,7 +160,7 @@ def _name(verdict: Verdict) -> Answer:
     certainty = f"probability {probability_text(verdict.probability)}"
     members = group_members(verdict)
     if members:
-        return Answer(question, f"one of {len(members)}", f"{certainty} that it is one of them")
+        return Answer(question, listing(members, "or"), f"{certainty} that it is one of them")
     if verdict.kind is VerdictKind.UNEXPLAINED:
         return Answer(question, "none of the catalogue", "")
     if curve_of(verdict.effects) is not None:

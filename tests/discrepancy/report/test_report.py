@@ -221,7 +221,7 @@ def test_members_of_a_group_stand_apart_and_first(drag):
         drag, kind=VerdictKind.GROUP, effects=(effect, rival), hypotheses=hypotheses,
         group=(effect.identifier, rival.identifier),
     )  # fmt: skip
-    assert ">one of 2<" in text
+    assert f">{effect.name} at slide or a rival at slide<" in text
     text = re.sub(' data-of="[^"]*"| class="name"', "", text)  # how cells look
     members = re.findall(r"<td>(\d?)</td><td>(.*?)</td>", text[text.index("The members of the group") :])
     assert [row for row in members if row[0]] == [("1", effect.name), ("2", "a rival")]
