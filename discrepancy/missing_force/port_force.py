@@ -430,6 +430,7 @@ def _explanatory_variables_of_trials(
         it is `STATE` alone.
     """
     is_of_state = trial_forces[0].is_of_state
+    position = np.concatenate([trial.position for trial in trial_forces])
     # an input that was not recorded in a trial did not act there
     names = dict.fromkeys(name for trial in trial_forces for name in trial.variables)
     other_variables = {
@@ -440,9 +441,7 @@ def _explanatory_variables_of_trials(
     }
     shares, ordered_by = explanatory_variables(
         force=np.concatenate([trial.force for trial in trial_forces]),
-        position=None
-        if is_of_state
-        else np.concatenate([trial.position for trial in trial_forces]),
+        position=None if is_of_state else position,
         speed=np.concatenate([trial.speed for trial in trial_forces]),
         time=np.concatenate([trial.time for trial in trial_forces]),
         other_variables=other_variables,

@@ -107,12 +107,11 @@ def _verb(interval: PrimitiveInterval, primitive: Primitive, *, is_flow: bool) -
     Empty if no verb says it. Of a law that grows faster than the displacement, the force is added
     to that of the spring.
     """
-    if isinstance(primitive, SensorLag):
+    if isinstance(primitive, SensorLag | LowPass):
         channel = "each channel" if primitive.channel == "*" else primitive.channel
+        if isinstance(primitive, LowPass):
+            return f"{channel} responds with a time constant of"
         return f"{channel} {'lags' if interval.value > 0.0 else 'leads'} by"
-    if isinstance(primitive, LowPass):
-        channel = "each channel" if primitive.channel == "*" else primitive.channel
-        return f"{channel} responds with a time constant of"
     if interval.parameter != "coefficient":
         return ""
     if isinstance(primitive, PowerDamping):
